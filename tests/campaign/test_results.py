@@ -93,12 +93,12 @@ def test_different_nodes_and_filters_and_the_world(tmp_path):
 
 def test_runs_that_are_not_finite_do_not_count():
     squared = np.array([1.0, np.nan, 4.0, np.inf])
-    score = _make_score((0, "n", "f", "nominal"), squared, np.array([1.0, np.nan, 3.0, 2.0]))
+    score = _make_score(0, "n", "f", "nominal", squared, np.array([1.0, np.nan, 3.0, 2.0]))
     assert (score.runs, score.finite_runs) == (4, 2)
     assert score.rmse == pytest.approx(np.sqrt(2.5)) and score.nees_per_dimension == 2.0
     # The mean of 1 and 4 has the standard error 1.5; that of its root is 1.5 / (2 sqrt(2.5)).
     assert score.rmse_error == pytest.approx(0.75 / np.sqrt(2.5)) and score.nees_error == 1.0
-    nothing = _make_score((0, "n", "f", "nominal"), squared[1:2], squared[1:2])
+    nothing = _make_score(0, "n", "f", "nominal", squared[1:2], squared[1:2])
     assert nothing.finite_runs == 0 and np.isnan([nothing.rmse, nothing.rmse_error, nothing.nees_per_dimension]).all()
 
 

@@ -99,6 +99,7 @@ class _Worker:
         is_late = Event()
 
         def give_up() -> None:
+            """Kill the process, and note that this was done because it is late."""
             is_late.set()
             process.kill()
 
@@ -110,7 +111,7 @@ class _Worker:
         assert process.stdout is not None
         line = process.stdout.readline()
         timer.cancel()
-        # A whole line is an answer; anything else means that the process ended.
+        # A whole line is an answer if the timer had not ended the process; else it ended, or was killed.
         if line.endswith("\n") and not is_late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()

@@ -92,14 +92,15 @@ def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray
     """
     error, variance = (np.asarray(group[name][setting, runs]) for name in ("error", "variance"))  # type: ignore[index]
     squared = error**2
-    claimed = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
-    counted = np.isfinite(squared).all(axis=(1, -1)) & claimed  # (run, node, filter), over steps and states
+    # Which runs count, (run, node, filter): those that are finite at all steps and in all states.
+    has_variance = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
+    counted = np.isfinite(squared).all(axis=(1, -1)) & has_variance
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.stack([squared, variance, squared / variance])
     # (value, run, step, node, filter, state): the mean over steps, then the given ones.
     kept = np.concatenate([values.mean(axis=2, keepdims=True), values[:, :, [step - 1 for step in steps]]], axis=2)
     kept = np.where(counted[None, :, None, :, :, None], kept, 0.0)
-    return ErrorSums(counted.sum(axis=0), kept.sum(axis=1), (kept**2).sum(axis=1))
+    return ErrorSums(runs=counted.sum(axis=0), values=kept.sum(axis=1), squares=(kept**2).sum(axis=1))
 
 
 def _compute_state_scores(
@@ -119,22 +120,22 @@ def _compute_state_scores(
         n = sums.runs[None, None, :, :, None]
         mean = sums.values / n
         standard_error = np.sqrt(np.maximum(sums.squares / n - mean**2, 0.0) / (n - 1))
-        # Each (step, node, filter, state).
-        squared_error, claimed_variance, nees = mean
-        squared_error_error, _, nees_error = standard_error
-        rmse, claimed = np.sqrt(squared_error), np.sqrt(claimed_variance)
-        rmse_error = np.where(rmse > 0, squared_error_error / (2 * rmse), 0.0)  # of a root, to first order
+        # The three values of `ErrorSums`, each (step, node, filter, state).
+        mean_squared_error, mean_claimed_variance, nees = mean
+        error_of_squared, _, nees_error = standard_error
+        rmse, claimed = np.sqrt(mean_squared_error), np.sqrt(mean_claimed_variance)
+        rmse_error = np.where(rmse > 0, error_of_squared / (2 * rmse), 0.0)  # of a root, to first order
     scores = []
     for k, i, j, s in np.ndindex(rmse.shape):
-        if claims[i, j]:
+        if claims[i, j]:  # else the node has no such filter
             scores.append(
                 StateScore(
-                    setting,
-                    labels.nodes[i],
-                    labels.filters[j],
-                    str(claims[i, j]),
-                    labels.states[s],
-                    steps[k],
+                    setting=setting,
+                    node=labels.nodes[i],
+                    filter=labels.filters[j],
+                    claim=str(claims[i, j]),
+                    state=labels.states[s],
+                    step=steps[k],
                     rmse=float(rmse[k, i, j, s]),
                     rmse_error=float(rmse_error[k, i, j, s]),
                     claimed=float(claimed[k, i, j, s]),

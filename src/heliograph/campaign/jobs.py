@@ -88,12 +88,12 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,
-        campaign.horizon,
-        campaign.chunk,
-        campaign.key(chunk.setting),
-        ErrorReducer(world=campaign.keep == "trajectories"),
-        make_network_inputs(campaign, network),
-        campaign.chunk,
+        horizon=campaign.horizon,
+        runs=campaign.chunk,
+        key=campaign.key(chunk.setting),
+        keep=ErrorReducer(world=campaign.keep == "trajectories"),
+        inputs=make_network_inputs(campaign, network),
+        chunk=campaign.chunk,
         first_run=chunk.start,
     )
     arrays = _arrange_results(recorded, labels)
@@ -151,12 +151,12 @@ def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarr
         labels: names along the axes of the store.
     """
     estimates = recorded["estimates"]
-    # Shapes are those of any filter; all have the same states.
+    # Shapes are those of any filter, (run, time, ...): all have the same states.
     example = next(values for filters in estimates.values() for values in filters.values())
     runs, horizon = example["nees_per_dimension"].shape
-    nodes, filters_count = len(labels.nodes), len(labels.filters)
+    node_count, filter_count = len(labels.nodes), len(labels.filters)
     arrays = {
-        variable: np.full((runs, horizon, nodes, filters_count, *example[variable].shape[2:]), np.nan)
+        variable: np.full((runs, horizon, node_count, filter_count, *example[variable].shape[2:]), np.nan)
         for variable in ("error", "variance", "nees_per_dimension")
     }
     # Each filter goes to its place along the axes (node, filter).
@@ -168,7 +168,7 @@ def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarr
     # Of whole trajectories also truth and measurements, each filled up to the longest of any node.
     if "truth" in recorded:
         arrays["truth"] = recorded["truth"]
-        arrays["measurement"] = np.full((runs, horizon, nodes, labels.received), np.nan)
+        arrays["measurement"] = np.full((runs, horizon, node_count, labels.received), np.nan)
         for node, z in recorded["measurements"].items():
             arrays["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
     return arrays

@@ -21,6 +21,7 @@ from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
 from heliograph.report.pages.page import Block, Code, Page, Picture, Points, Section, Table, Text
 
 REPORT = "report.html"
+DASHED = (0, (4, 1.6))  # of matplotlib: offset, then lengths of dashes and gaps
 ROWS = 200  # of the table on the page
 REPORTED = 20  # failures on the page
 PANELS, SETTINGS, PARAMETERS = 6, 20, 3  # more than that is in the table
@@ -175,7 +176,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
     shown = dict(list(_group_into_panels(campaign, scores, parameter).items())[:PANELS])
     figure, grid = _make_panels(len(shown), 2.5)
     colours = _assign_colours(scores)
-    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):
+    for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):  # the grid may end with an empty place
         for name in dict.fromkeys(score.filter for score in of_panel):
             curve = [score for score in of_panel if score.filter == name]
             curve.sort(key=lambda score: float(values[score.setting]))
@@ -218,10 +219,10 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Score
             label = quote_for_figure(name)
             axes.errorbar(x, heights, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=label)
         axes.set_yticks(range(len(settings)), [_name_setting(campaign, setting) for setting in settings])
-        axes.set_ylim(len(settings) - 0.5, -0.5)
+        axes.set_ylim(len(settings) - 0.5, -0.5)  # from below: the first setting is on top
         axes.set_title(quote_for_figure(node))
-        if quantity is NEES:
-            axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+        if quantity is NEES:  # which is 1 where the claim is right
+            axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=DASHED)
     # One scale for all panels, and one legend.
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
     _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
@@ -239,7 +240,7 @@ def _name_setting(campaign: Campaign, setting: int) -> str:
 def _make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
     """Return a figure with `count` axes that share their scales, in rows; axes beyond the count are hidden."""
     columns = min(columns, max(count, 1))
-    rows = -(-max(count, 1) // columns)
+    rows = math.ceil(max(count, 1) / columns)
     figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
     grid = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
     for axes in grid[count:]:
@@ -265,7 +266,7 @@ def _finish_figure(
     """Add what all panels share: the line NEES = 1, the scale, the quantity's name and the legend."""
     if quantity is NEES:
         for axes in grid:
-            axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+            axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=DASHED)
     _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
     figure.supylabel(quantity.label, fontsize=10, color=INK)
     _draw_legend(figure, grid, colours)

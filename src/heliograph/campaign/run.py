@@ -118,15 +118,16 @@ def _compute_missing(
         return CampaignRun(out, already, computed=0, failures=[], damaged=[])
     failed: dict[Job, Reply] = {}
     if missing or damaged:
-        count = _count_workers(workers, len(missing) or 1)
+        count = _count_workers(workers, len(missing) or 1)  # one where only what was damaged is described again
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it is not right for what is computed now
             failed = _compute_settings(engine, campaign, store, missing, already, progress)
     remove_partial(store)
-    # Reports are written again after every call. A setting that could not be built lacks all its chunks.
+    # Reports are written again after every call.
     failures = [describe_failure(campaign, out, job, reply) for job, reply in failed.items()]
     write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
+    # A job without a chunk is that of a setting, whose network could not be built.
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
     return CampaignRun(out, already, computed=len(missing) - lacking, failures=failures, damaged=damaged)
 
@@ -200,12 +201,12 @@ def _prepare_store(
     """
     is_new = not store.is_dir()
     if is_new:
-        lacking = list(range(len(campaign.settings)))
+        without_claims = list(range(len(campaign.settings)))
     else:
         # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
         begun = {setting for setting, _ in find_done_chunks(store, campaign)}
-        lacking = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
-    jobs = [Job(setting) for setting in lacking]
+        without_claims = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
+    jobs = [Job(setting) for setting in without_claims]
     described: dict[int, NetworkDescription] = {}
 
     def accept(job: Job, value: NetworkDescription | None, done: int) -> None:
@@ -218,12 +219,12 @@ def _prepare_store(
     if is_new and not described:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
-    # The axes of a new store are the union of all settings; later settings must fit into them.
+    # The names along the axes of a new store are those of all settings; settings that come later must fit into them.
     labels = {setting: restore_labels(described[setting]["labels"]) for setting in sorted(described)}
     if is_new:
         create_store(store, campaign, unite_labels(labels))
-    for setting, of_setting in labels.items():
-        check_within(of_setting, read_labels(store), setting)
+    for setting, labels_of_setting in labels.items():
+        check_within(labels_of_setting, read_labels(store), setting)
         write_claims(store, setting, described[setting]["claims"])
     return failed
 

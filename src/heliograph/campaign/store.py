@@ -135,7 +135,7 @@ def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
         coordinates = _make_coordinates(campaign, labels)
         for name, values in coordinates.items():
             _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
-        # Empty variables, of a file for each chunk of runs of each setting; the claims of a setting are one file.
+        # Variables, empty so far. A file is one chunk of runs of one setting; the claims of a setting are one file.
         sizes = {name: len(values) for name, values in coordinates.items()}
         for name, (axes, meaning) in variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
@@ -183,7 +183,8 @@ def _write_as_text(value: object) -> str:
 def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: str) -> None:
     """Create a coordinate along an axis, of one chunk, and write its values."""
     fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
-    _create_array(group, name, (axis,), values.shape, values.shape, fill=fill, attributes={}, kind=values.dtype)
+    shape = values.shape
+    _create_array(group, name, (axis,), shape=shape, chunks=shape, fill=fill, attributes={}, kind=values.dtype)
     _open(group, name)[...] = values
 
 

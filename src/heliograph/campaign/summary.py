@@ -91,7 +91,8 @@ def read_summary(path: str | Path) -> list[Score]:
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
     """Return the scores of every filter by setting and node; the store is read chunk by chunk."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
-    claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)  # (setting, node, filter), "" of none
+    claims = np.asarray(group[CLAIM])  # (setting, node, filter), "" where the node has no such filter
+    done = find_done_chunks(store, campaign)
     scores = []
     for setting in range(len(campaign.settings)):
         # Squared error and NEES of each run, averages over time (run, node, filter), of the chunks that are done.
@@ -100,14 +101,13 @@ def summarize(store: Path, campaign: Campaign) -> list[Score]:
             for chunk in campaign.chunks(setting)
             if (setting, chunk.number) in done
         ]
-        empty = np.empty((2, 0, len(labels.nodes), len(labels.filters)))
-        squared, nees = np.concatenate(by_chunk, axis=1) if by_chunk else empty
+        without_runs = np.empty((2, 0, len(labels.nodes), len(labels.filters)))
+        squared, nees = np.concatenate(by_chunk, axis=1) if by_chunk else without_runs
         # A score for each filter that the node has.
         for i, node in enumerate(labels.nodes):
             for j, name in enumerate(labels.filters):
-                if claims[setting, i, j]:
-                    names = setting, node, name, str(claims[setting, i, j])
-                    scores.append(_make_score(names, squared[:, i, j], nees[:, i, j]))
+                if claim := str(claims[setting, i, j]):
+                    scores.append(_make_score(setting, node, name, claim, squared[:, i, j], nees[:, i, j]))
     return scores
 
 
@@ -130,17 +130,20 @@ def _read_runs(group: zarr.Group, name: str, setting: int, runs: slice) -> np.nd
     return np.asarray(array[setting, runs])
 
 
-def _make_score(names: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
-    """Return RMSE and NEES of a filter with their standard errors, from squared errors and NEES of each run (run,).
+def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndarray, nees: np.ndarray) -> Score:
+    """Return RMSE and NEES of the filter `name` with their standard errors.
 
-    `names` are setting, node, filter and claim.
+    `squared`, `nees`: its squared error and NEES in each run (run,).
     """
     finite = np.isfinite(squared)
     mse, mse_error = _compute_mean(squared[finite])
     mean_nees, nees_error = _compute_mean(nees[finite])
     rmse = float(np.sqrt(mse))
     return Score(
-        *names,
+        setting=setting,
+        node=node,
+        filter=name,
+        claim=claim,
         rmse=rmse,
         rmse_error=mse_error / (2 * rmse) if rmse else 0.0,  # of a root, to first order
         nees_per_dimension=mean_nees,
