@@ -185,7 +185,7 @@ def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: st
     fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
     shape = values.shape
     _create_array(group, name, (axis,), shape=shape, chunks=shape, fill=fill, attributes={}, kind=values.dtype)
-    _open(group, name)[...] = values
+    _open_array(group, name)[...] = values
 
 
 def _create_array(
@@ -224,7 +224,7 @@ def _create_array(
     )
 
 
-def _open(group: zarr.Group, name: str) -> zarr.Array[Any]:
+def _open_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     """Return an array of the store that writes a chunk's file even if it has only fill values.
 
     The file marks the chunk as done.
@@ -238,19 +238,19 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
     """Write the values (run, ...) of one chunk of runs, one file for each variable."""
     group = zarr.open_group(path, mode="r+")
     for name, block in values.items():
-        _open(group, name)[chunk.setting : chunk.setting + 1, chunk.start : chunk.stop] = block[None]
-        _sync(path / name, f"c.{chunk.setting}.{chunk.number}.")
+        _open_array(group, name)[chunk.setting : chunk.setting + 1, chunk.start : chunk.stop] = block[None]
+        _sync_files(path / name, f"c.{chunk.setting}.{chunk.number}.")
 
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
     """Write the claims of the filters of one setting."""
     labels = read_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
-    _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
-    _sync(path / CLAIM, f"c.{setting}.")
+    _open_array(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
+    _sync_files(path / CLAIM, f"c.{setting}.")
 
 
-def _sync(folder: Path, start: str) -> None:
+def _sync_files(folder: Path, start: str) -> None:
     """Make files of a folder whose names begin with `start` outlast a loss of power, and that they are there."""
     for file in folder.glob(f"{start}*"):
         sync(file)

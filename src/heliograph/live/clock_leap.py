@@ -39,8 +39,8 @@ class Leap(NamedTuple):
     back: float | None = None
     earlier: "Leap | None" = None
 
-    def chain(self) -> Iterator["Leap"]:
-        """Yield this leap, and those before it that are believed."""
+    def list_with_earlier(self) -> Iterator["Leap"]:
+        """Yield this leap, then those before it that are believed, the newest first."""
         leap: Leap | None = self
         while leap is not None:
             yield leap
@@ -74,8 +74,10 @@ class Leap(NamedTuple):
             return True
         if now - self.since >= self.since - time:
             return False  # it is late for no longer than the plant has gone on
-        # By its own clock only the second message in a row, if it goes on from the first more closely than to the leap.
-        return clock != self.clock or (self.back is not None and self.back < time < self.back + self.time - time)
+        if clock != self.clock:
+            return True
+        # By its own clock the second message in a row, if it goes on from the first (`back`) closer than to the leap.
+        return self.back is not None and self.back < time < self.back + self.time - time
 
 
 def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
@@ -89,7 +91,7 @@ def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[
         time: what a clock says.
         most: the longest gap that is no leap.
     """
-    for candidate in leap.chain() if leap else ():
+    for candidate in leap.list_with_earlier() if leap else ():
         if candidate.now < time < candidate.time - most:
             return candidate, now
         now = candidate.now

@@ -46,6 +46,11 @@ class CheckedEvent(NamedTuple):
     arrival: float
 
     @property
+    def is_inputs(self) -> bool:
+        """Return whether it holds the plant's inputs, and no measurement of a node."""
+        return self.node_index < 0
+
+    @property
     def name(self) -> tuple[int, int, float]:
         """Return the key of the event. It contains the time, since counts start again after a reboot."""
         return self.node_index, self.sequence, self.time

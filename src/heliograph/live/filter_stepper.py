@@ -43,7 +43,8 @@ class NativeFilterStepper:
         The code reads and writes the same arrays at each call: here they get names.
         """
         self._code = code.again(numbers)
-        # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state).
+        # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state). Of both
+        # the state's leaves are n.
         arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
         self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
         self._judged: Float[np.ndarray, " parts"] = results[0]
@@ -203,7 +204,7 @@ def _compile_step(
         shapes: shape and type of each argument: the filter's numbers, leaves of its state, z, u, k.
         counts: how many of the arguments are numbers, and how many leaves of the state.
         tree: structure of the state.
-        engine: the setting of the engine, by which results are kept apart.
+        engine: the setting of the engine. It is not read here: each setting has a compiled step of its own.
     """
     number_count, state_count = counts
     state_end = number_count + state_count
@@ -213,6 +214,7 @@ def _compile_step(
         numbers, before = arguments[:number_count], arguments[number_count:state_end]
         z, u, k = arguments[state_end:]
         judged, flagged, after, estimate = _judge_step(static, numbers, tree.unflatten(before), z, u, k)
+        # The new state has to fit over the old one.
         if any(new.shape != old.shape or new.dtype != old.dtype for new, old in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
         # The state that replaces the old one: unchanged if the step was flagged.
@@ -220,8 +222,8 @@ def _compile_step(
         return judged, flagged, after, estimate, next_state
 
     def compile_code() -> Any:
-        """Return the code of the step; its last results are written over the arguments of the state."""
-        # The last results are written over the arguments of the state: {number of the result: of the argument}.
+        """Return the code of the step; the next state is written over the arguments of the state."""
+        # {number of a result: number of the argument that it is written over}; results are numbered from the end (-1).
         in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
@@ -263,9 +265,9 @@ class CompiledFilter:
         self.filter, self.horizon = filter, filter.horizon
         self.received, self.given = filter.received, len(filter.inputs)
         self.values = 0
-        if sender := find_deciding_sender(filter):  # behind its values come the numbers of lost ones
+        if sender := find_deciding_sender(filter):  # behind its values come the numbers of messages lost before each
             self.values = filter.received - sender.trigger.side_information(sender.outputs)
-        # The filter in double precision as arrays and the rest; its initial state.
+        # The filter in double precision, as its arrays and all that is no array; its initial state.
         with jax.enable_x64(True):
             self.numbers, self._static = split_structure(filter)
             self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
@@ -274,10 +276,19 @@ class CompiledFilter:
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)  # z, u, k: shapes to compile for
         with jax.enable_x64(True):
             modes = jax.eval_shape(filter.estimate, self._start).modes
-        self.estimate: PyTree = jax.tree.structure(
-            JudgedEstimate(np.zeros(()), np.zeros(()), filter.claim, modes, filter.attitude, 0.0, 0)
+        # The numbers of this estimate stand for any: only its structure counts.
+        example = JudgedEstimate(
+            mean=np.zeros(()),
+            covariance=np.zeros(()),
+            claim=filter.claim,
+            modes=modes,
+            attitude=filter.attitude,
+            nis=0.0,
+            received=0,
         )
-        # With so many degrees of freedom nis is chi-square of an honest filter; nothing exceeds it where none arrived.
+        self.estimate: PyTree = jax.tree.structure(example)
+        # The nis of a filter whose claim holds is chi-square, with as many degrees of freedom as numbers arrived. Where
+        # none did, there is none: infinity is never exceeded.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:

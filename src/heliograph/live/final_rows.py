@@ -23,7 +23,7 @@ class FinalRows:
         while self._count - len(self._parts[0][0]) >= self.most:
             self._count -= len(self._parts.popleft()[0])
 
-    def take(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
+    def take_all(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
         """Remove and return all times and rows."""
         times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
         self._parts.clear()
@@ -38,7 +38,7 @@ class GateCounts:
         self._columns = {(f.node, f.filter): list(f.weighed.weight) for f in filters if f.weighed is not None}
         self.counts = dict.fromkeys(self._columns, 0)
 
-    def add(self, rows: Float[np.ndarray, "row output"]) -> None:
+    def count_weights_of_zero(self, rows: Float[np.ndarray, "row output"]) -> None:
         """Count in the outputs of some rows the weights of 0; what did not arrive has none."""
         for name, columns in self._columns.items():
             self.counts[name] += int(np.count_nonzero(rows[:, columns] == 0))

@@ -85,7 +85,7 @@ class Fleet:
         self.watched = find_silence_rules(network)
         self.deciding = {name: rule.trigger for name, rule in self.watched.items() if rule.trigger is not None}
         self._values_before_losses = count_values_before_losses(network, self.deciding)
-        # A slot with the prior, for plants that have not begun.
+        # A slot with the prior, at step -1, for plants that have not begun.
         self._blank = self.pool.take_slot()
         self.pool.write_prior(self._blank, -1.0)
 
@@ -127,7 +127,8 @@ class Fleet:
         chains = []
         for plant, step in plants:
             before = plant.silence or plant.rows.held[-1]
-            if step <= before.key[0]:  # it is that far already
+            is_there_already = step <= before.key[0]
+            if is_there_already:
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.pool.take_slot()
             plant.silence = HeldRow((step, 0, 0), slot, self.width)
@@ -180,10 +181,11 @@ class Fleet:
         if len(values) == outputs:
             values = values + [nan] * (size - outputs)
         # A sender of single components: behind each value that arrived (is not NaN) has to stand a number.
-        by_component = self.deciding[node].region == "each" and len(values) == size
-        if by_component and any(
+        is_by_component = self.deciding[node].region == "each" and len(values) == size
+        lacks_number = is_by_component and any(
             value == value and lost != lost for value, lost in zip(values[:outputs], values[outputs:], strict=True)
-        ):
+        )
+        if lacks_number:
             expected = "behind each value how many of its component were lost since the last"
             raise fail(
                 f"message of {node!r}, values", expected, "none, and its count is of messages, not of components"
@@ -221,7 +223,7 @@ class Fleet:
         if limits is not None:
             screened = self._screen_by_limits(limits, node, screened)
         if watch is not None:
-            screened = screened._replace(repeats=watch.follow(screened.event.values, screened.repeats))
+            screened = screened._replace(repeats=watch.extend_runs(screened.event.values, screened.repeats))
         return screened
 
     def _screen_by_limits(self, limits: Limits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
@@ -251,7 +253,7 @@ class Fleet:
             wall: time by the clock on the wall, if it is known.
             clock: name of the node by whose clock it is dated (None: its own).
         """
-        if self.program.dt is None and event.time > LAST_STEP:
+        if self.program.dt is None and event.time > LAST_STEP:  # beyond it one step cannot be told from the next
             return "future"
         # The clock that says how late it is: that of arrivals where one was given, else the sender's.
         longest_gap = self.options.leap
@@ -297,15 +299,16 @@ class Fleet:
         `touched`: the plants that have taken events, or whose time went on.
         """
         plants, results = list(touched), []
-        self.step(plants)
+        self.step_changed_rows(plants)
         for plant in plants:
             withdrawn, their_slots = plant.take_withdrawn()
             watermark = np.inf if all_ else plant.confirmed - self.options.window
             final, left = plant.finalise_rows(watermark, self.options.leap)
-            results.append(FinalisedPlant(plant, final, plant.rows.held[-1], left + their_slots, withdrawn))
+            newest = plant.rows.held[-1]
+            results.append(FinalisedPlant(plant, final, newest, left=left + their_slots, withdrawn=withdrawn))
         return results
 
-    def step(self, plants: Iterable[PlantState]) -> None:
+    def step_changed_rows(self, plants: Iterable[PlantState]) -> None:
         """Step the rows that have changed, and all after them, for all plants at once; write them into the table."""
         chains = [chain for plant in plants if (chain := plant.take_dirty_rows())]
         if rows := [row for chain in chains for row in chain]:
@@ -315,13 +318,14 @@ class Fleet:
 
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
         """Step from the first row of each chain into the second, and so on; their numbers stand in the table."""
-        walks = [cut_into_legs(chain, self.program.dt is None, self.end_step == np.inf) for chain in chains]
+        by_steps, endless = self.program.dt is None, self.end_step == np.inf
+        walks = [cut_into_legs(chain, by_steps, endless) for chain in chains]
         # All chains up to their first long gap at once, over these one by one, and so on.
         while walks:
             for steps in group_by_turn(legs[0].steps for legs in walks):
-                self.pool.step(*map(np.array, zip(*steps, strict=True)))
+                self.pool.step_slots_in_place(*map(np.array, zip(*steps, strict=True)))
             for legs in walks:
-                if len(legs) > 1:
+                if len(legs) > 1:  # a long gap follows the leg
                     self.pool.pass_long_gap(legs[0].steps[-1][1], legs[0].jump)
             walks = [legs[1:] for legs in walks if len(legs) > 1]
 
@@ -345,7 +349,7 @@ class Fleet:
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
         return self.pool.predict_outputs(np.array(slots), given, self.end_step)
 
-    def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
+    def outputs_after(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
         """Return the outputs of all filters (row, output) after the rows in these slots of the table."""
         return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 

@@ -81,23 +81,23 @@ class JudgementReader:
             return {}
         flagged = self._find_flagged(taken)
         reasons = {i: why for i in flagged if (why := self._explain_event(taken[i]))}
-        # Of several nodes' events that were judged together only the one to blame; of one node in one row the largest.
+        # Of several nodes' events that were judged together only the one to blame stays in `reasons`.
         self._drop_blameless(taken, reasons)
+        # By row and node, the index of the event with the largest number.
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
             node_of_row = taken[i].row.slot, taken[i].event.node_index
             largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j].event))
-        # What came after implausible inputs of its plant was judged with these: it may be all right without them.
+        # By plant, the index of its first implausible inputs. What came after them was judged with them: it may be all
+        # right without them.
         first_inputs: dict[str, int] = {}
         for i in reasons:
-            if taken[i].event.node_index < 0:
+            if taken[i].event.is_inputs:
                 first = first_inputs.setdefault(taken[i].plant.name, i)
                 first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)
-        return {
-            i: why + self._name_faulty_function(taken[i])
-            for i, why in reasons.items()
-            if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i
-        }
+        # The largest of their node in their row, and, of a plant with implausible inputs, these alone.
+        to_refuse = [i for i in reasons if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i]
+        return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
     def _find_flagged(self, taken: Sequence[Candidate]) -> list[int]:
         """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none."""
@@ -110,7 +110,7 @@ class JudgementReader:
         """Return why a candidate is implausible by the judgements of its row; None if it is not, or has no number."""
         event, pool = candidate.event, self.fleet.pool
         outputs = pool.table[candidate.row.slot, pool.outputs]
-        if event.node_index < 0:  # inputs
+        if event.is_inputs:
             return self.explain_inputs(outputs)
         if _largest_number(event) < 0:
             return None
@@ -125,7 +125,7 @@ class JudgementReader:
         event, row = candidate.event, candidate.row
         row_before, outputs = self._find_row_before(candidate), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]
         # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
-        concerned = None if event.node_index < 0 else (Network.FUSED, self.fleet.network.names[event.node_index])
+        concerned = None if event.is_inputs else (Network.FUSED, self.fleet.network.names[event.node_index])
         for columns in self.fleet.program.filter_columns:
             filter = filter_of(self.fleet, columns)
             if filter is None or (concerned is not None and columns.node not in concerned):

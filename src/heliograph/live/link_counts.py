@@ -121,7 +121,8 @@ class LinkCounts:
         """
         sequence = self._unwrap_count(sequence, time, period)
         if verdict == "used":
-            self.latest = time if self.used == 1 else max(self.latest, time)
+            is_first_used = self.used == 1  # it is counted already; times before it say nothing
+            self.latest = time if is_first_used else max(self.latest, time)
             # The number after the newest, as of nearly all messages: nothing was lost.
             if sequence - 1 == self.newest >= 0 and time >= self.at:
                 self.newest, self.at = sequence, time

@@ -42,8 +42,8 @@ def convert_to_covariances(
     """Return rows with the entries of L D L' in the places of those of L below its diagonal, and of D."""
     rows = rows.copy()
     for lower, variances in places:
-        root, n = unit_lower(rows[:, lower]), variances.shape[-1]
-        covariance = (root * rows[:, variances][..., None, :]) @ np.swapaxes(root, -1, -2)
+        root, n = unit_lower(rows[:, lower]), variances.shape[-1]  # L
+        covariance = (root * rows[:, variances][..., None, :]) @ np.swapaxes(root, -1, -2)  # (L D) L'
         rows[:, lower] = covariance[..., *np.tril_indices(n, -1)]
         rows[:, variances] = np.diagonal(covariance, axis1=-2, axis2=-1)
     return rows
@@ -57,7 +57,7 @@ def convert_to_factors(
     for lower, variances in places:
         n = variances.shape[-1]
         covariance = np.zeros((len(rows), *variances.shape, n))
-        below = np.tril_indices(n, -1)
+        below = np.tril_indices(n, -1)  # entries (i, j) below the diagonal, of which (j, i) are equal
         covariance[..., *below] = covariance[..., *below[::-1]] = rows[:, lower]
         covariance[..., np.arange(n), np.arange(n)] = rows[:, variances]
         rows[:, lower], rows[:, variances] = factorise_covariance(covariance)
@@ -121,14 +121,15 @@ def _pass_silent_steps(
         entries_moving = _find_moving(*probe)
         if not entries_moving.any():
             return after_probes[-1]
-        # After 1, 2, 4, ... probes the map is tried, which costs a step for each entry; it starts before the last one.
+        # After 1, 2, 4, ... probes (i + 1 is a power of two) the map is tried, which costs a step for each entry. It
+        # starts from the state before the newest probe, which it has to predict.
         if i & (i + 1) == 0:
             begin, left = at + i * PROBED, count - i * PROBED
             jumped = _jump_by_affine_map(step_covariances, probe, entries_moving, begin, left)
             if jumped is not None:
                 return _restore_factors(jumped, places)
     done = PROBED * (len(after_probes) - 1)
-    if count - done < PROBED:
+    if count - done < PROBED:  # few enough to be stepped one by one
         return _step_through(step, after_probes[-1], at + done, count - done)
     return _restore_factors(_extrapolate_state(with_covariances(after_probes), count - done), places)
 

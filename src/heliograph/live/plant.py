@@ -176,19 +176,21 @@ class PlantState:
             names: those of the nodes in their order, then that of the inputs.
         """
         held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
-        all_after = first_after == 0  # then only the row kept from before the leap can be gone back to
+        all_after = first_after == 0  # all rows held are of the leap: only the one kept from before it is left
         if all_after and self.kept is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
         not_final = held[max(first_after, 1) :]
         self._count_withdrawn(not_final, leap, names)
         gone = held[first_after:]
-        self.aside.append(RowsOfLeap(held, self.kept, changes=len(self.changes), gone=gone, rows=not_final))
+        # What `undo_changes` needs to take this back.
+        self.aside.append(RowsOfLeap(held=held, kept=self.kept, changes=len(self.changes), gone=gone, rows=not_final))
         if all_after and self.kept is not None:
             self.rows.replace_rows([self.kept.row])  # the base again
             self.kept = None
         else:
             self.rows.replace_rows(held[:first_after])
+        # Rows from `dirty` on were to be stepped again: nothing is to be done if all of them are gone.
         if self.dirty is not None and self.dirty >= len(self.rows.held):
             self.dirty = None
         self.now, self.leap = leap.now, leap.earlier
@@ -322,7 +324,7 @@ class PlantState:
         `left`: rows that are not held any more.
         """
         # The oldest leap that is not confirmed, other than the one with which the plant began.
-        leaps = [] if self.leap is None else [leap for leap in self.leap.chain() if leap.now > -inf]
+        leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
         if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
             left, self.kept = [*left, self.kept.row], None

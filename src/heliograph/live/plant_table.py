@@ -27,6 +27,8 @@ class SlotTable:
     def __init__(self, program: NetworkProgram, alone: bool = False):
         """Make a table with FEWEST free slots for rows of a network's program; `alone`: single rows are stepped."""
         self.program, self.step_rows, self._alone = program, program.step_rows, alone
+        # A row has, one after another: the filters' states, their outputs, the inputs that hold after it, its step
+        # number, and the numbers that came (measurements, inputs, time).
         sizes = self.step_rows.state.size, self.step_rows.outputs.size
         ends = np.cumsum([*sizes, program.given, 1, program.received + program.given + 1])
         self.state, self.outputs, self.held, self.at, self.numbers = (
@@ -36,7 +38,7 @@ class SlotTable:
         self._free = list(range(FEWEST - 1, -1, -1))
 
     @cached_property
-    def _one(self) -> Callable[..., np.ndarray]:
+    def _step_single_row(self) -> Callable[..., np.ndarray]:
         """Return the step of one row at a time, with memory of this pool's own."""
         return self.step_rows.for_one()
 
@@ -71,14 +73,14 @@ class SlotTable:
         number is at most `last`, the last step for which the network is defined.
         """
         dt, table = self.program.dt, self.table
-        u = np.where(np.isnan(given), table[before, self.held], given)
+        u = np.where(np.isnan(given), table[before, self.held], given)  # held: the inputs that hold after a row
         u = u if dt is None else _insert_time_step(u, dt, np.ones(len(u)))
         k = np.minimum(table[before, self.at.start] + 1, last)
         nothing = np.full((len(before), self.program.received), np.nan)
-        done = self._step_parts(table[before, self.state], nothing, u, k[:, None])
-        return done[:, self.step_rows.state.size :].copy()
+        state_and_outputs = self._step_parts(table[before, self.state], nothing, u, k[:, None])
+        return state_and_outputs[:, self.step_rows.state.size :].copy()
 
-    def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
+    def step_slots_in_place(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
         """Step from the rows in the slots `before` into those in `after`; `at`: the step number in discrete time.
 
         In discrete time a row is reached by as many steps as lie between it and the row before; its measurement is
@@ -90,15 +92,15 @@ class SlotTable:
         now_held = np.where(np.isnan(given), held, given)
         if dt is None:
             # On the way to a row nothing is received, and the inputs are those of before.
-            arrives = (at == numbers[:, -1])[:, None]
+            arrives = (at == numbers[:, -1])[:, None]  # the row's own step, not one on the way
             received, u = np.where(arrives, received, np.nan), np.where(arrives, now_held, held)
             now_held, k = u, at
         else:
             # Inputs given with a row hold from there on: those of before led to it.
             u = _insert_time_step(held, dt, numbers[:, -1] - table[before, -1])
             k = table[before, self.at.start] + 1
-        done = self._step_parts(table[before, self.state], received, u, k[:, None])
-        table[after, : self.outputs.stop] = done
+        state_and_outputs = self._step_parts(table[before, self.state], received, u, k[:, None])
+        table[after, : self.outputs.stop] = state_and_outputs
         table[after, self.held], table[after, self.at.start] = now_held, k
 
     def _step_parts(self, *parts: np.ndarray) -> np.ndarray:
@@ -107,7 +109,7 @@ class SlotTable:
         The result for a single row is overwritten by the next call.
         """
         if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
-            return self._one(*parts)
+            return self._step_single_row(*parts)
         return self.step_rows(np.concatenate(parts, axis=1))
 
     def inputs_between(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
@@ -138,7 +140,7 @@ class SlotTable:
 
         Copies of the last row behind them make their number a power of two, so that few lengths are compiled.
         """
-        length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())
+        length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())  # the next power of two
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]
         state, outputs = rows[:, self.state], rows[:, self.outputs]
         return self.step_rows.history(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start], outputs)
@@ -173,7 +175,7 @@ def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[L
         numbers: Sequence[float] = range(begin, int(last) + 1) if by_steps else (last,)
         if len(numbers) > LONG and endless:
             # One step into the new row, which is then taken in place to TAIL steps before its own; these one by one.
-            legs[-1] = Leg([*legs[-1].steps, (before, next_row.slot, begin)], int(last) - TAIL)
+            legs[-1] = Leg([*legs[-1].steps, (before, next_row.slot, begin)], jump=int(last) - TAIL)
             legs.append(Leg([]))
             before, numbers = next_row.slot, range(int(last) - TAIL + 1, int(last) + 1)
         for at in numbers:

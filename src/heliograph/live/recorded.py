@@ -63,7 +63,7 @@ def replay_events(
     # Order of arrival; without an arrival time an event arrives when it is measured.
     in_order = sorted(events, key=_arrival_of) if isinstance(events, Sequence) else events
     smoother = None if lag is None else _LaggedSmoother(timeline, lag)
-    # Final estimates are collected before the timeline would drop any.
+    # The timeline keeps a bounded number of final rows: they are collected before it would drop any.
     finals: list[Record] = []
     count = 0
     for count, event in enumerate(in_order, 1):
@@ -78,7 +78,7 @@ def replay_events(
         raise fail("events", "at least one", "none")
     if smoother is not None:
         smoother.smooth_until(np.inf)
-    # The rest becomes final.
+    # The rest becomes final: what is older than the window does, and so all is once that has passed, and a bit more.
     timeline.advance(timeline.now + window + 1.0)
     finals.append(timeline.final())
     lagged = None if smoother is None else _make_record(network, smoother.smoothed)
@@ -129,7 +129,8 @@ def _join_records(parts: Sequence[Record]) -> Record:
         }
         for node, filters in parts[0].estimates.items()
     }
-    return Record(np.concatenate([record.time for record in parts]), parts[0].states, None, {}, estimates)
+    time = np.concatenate([record.time for record in parts])
+    return Record(time=time, states=parts[0].states, truth=None, measurements={}, estimates=estimates)
 
 
 def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
@@ -142,7 +143,8 @@ def _make_record(network: Network, parts: Sequence[tuple[float, Mapping[str, Map
         }
         for node, filters in (results[0] if results else {}).items()
     }
-    return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
+    time = np.array([time for time, _ in parts])
+    return Record(time=time, states=network.states, truth=None, measurements={}, estimates=estimates)
 
 
 def _stack_estimates(parts: Sequence[Estimate], join: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:

@@ -14,6 +14,7 @@ from heliograph.random_affine.noise import AbstractNoise
 from heliograph.simulation.node import Node
 
 FIRST = Repeats()  # before the first reading
+KEPT_BOUNDS = 10_000  # of outputs and resolutions; then all are forgotten, and computed anew
 SURE = 1e-12  # of a probability below one: a run is as long as one likes
 
 
@@ -50,7 +51,7 @@ class RepeatWatch:
         try:
             for noise in noises:
                 bound_equal_readings(noise, np.full(received, inf))
-        except ValueError:
+        except ValueError:  # a law of which no bound is known
             return None
         return RepeatWatch(noises)
 
@@ -62,34 +63,36 @@ class RepeatWatch:
         refuses = node.limits is not None and node.limits.stuck is not None
         return None if refuses else RepeatWatch.for_sensor(node.sensor, node.channel, node.received)
 
-    def follow(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
+    def extend_runs(self, values: Sequence[float], before: Repeats | None = None) -> Repeats:
         """Return the runs that end with these readings, NaN where none arrived, after those `before`, if any.
 
         Its `found` has one more where a run has become too long with this reading.
         """
         m, before = len(values), before or FIRST
-        # The fields of `Repeats` by component, to be changed in place.
+        # The fields of `Repeats`, a list each with one entry for each component, to be changed in place. They are empty
+        # before the first reading.
         newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
-        steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
+        least_steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
         equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
         for i, value in enumerate(values):
-            if value != value:  # NaN
+            if value != value:  # NaN: nothing arrived, and the run goes on
                 continue
             if value == newest[i]:
                 lengths[i] += 1
                 equal[i] += 1
             else:  # a new run; the least difference of two successive readings bounds the resolution
                 if readings[i]:
-                    steps[i] = min(steps[i], abs(value - newest[i]))
+                    least_steps[i] = min(least_steps[i], abs(value - newest[i]))
                 newest[i], lengths[i] = value, 1
             readings[i] += 1
-            # Found once, when its length reaches what is too long.
+            # Found once, when its length reaches what is too long. Shorter than LEAST none is: most end here.
             if lengths[i] >= LEAST:
-                found[i] += lengths[i] == self._count_too_many(i, lengths[i], steps[i], readings[i], equal[i])
+                too_long = self._count_too_many(i, lengths[i], least_steps[i], readings[i], equal[i])
+                found[i] += lengths[i] == too_long
         return Repeats(
             newest=tuple(newest),
             lengths=tuple(lengths),
-            steps=tuple(steps),
+            steps=tuple(least_steps),
             readings=tuple(readings),
             equal=tuple(equal),
             found=tuple(found),
@@ -112,7 +115,7 @@ class RepeatWatch:
         """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading."""
         key = output, step
         if key not in self._bounds:
-            if len(self._bounds) > 10_000:
+            if len(self._bounds) > KEPT_BOUNDS:
                 self._bounds.clear()
             bounds = [bound_equal_readings(noise, np.full(noise.dimension, step))[output] for noise in self.noises]
             self._bounds[key] = float(max(bounds))

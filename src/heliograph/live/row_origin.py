@@ -21,12 +21,19 @@ def make_row_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarra
     pool, program = fleet.pool, fleet.program
     row = pool.table[slot].copy()
     held, several = row[..., pool.held], row.ndim > 1
+    # Among the inputs stands the time step, which is not known ahead.
     inputs = held if program.dt is None else np.insert(held, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
-    state = program.step_rows.state.tree(row[..., pool.state])
-    estimates, step = estimates_by_name(program, row[..., pool.outputs]), row[..., pool.at.start].astype(int) + 1
+    step = row[..., pool.at.start].astype(int) + 1
     return Origin(
-        program.network, state, step if several else int(step), inputs, time, spacing, estimates, several=several
+        model=program.network,
+        state=program.step_rows.state.tree(row[..., pool.state]),
+        step=step if several else int(step),
+        inputs=inputs,
+        time=time,
+        spacing=spacing,
+        estimates=estimates_by_name(program, row[..., pool.outputs]),
+        several=several,
     )
 
 

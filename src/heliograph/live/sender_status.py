@@ -110,13 +110,12 @@ class SilenceRule(NamedTuple):
         since = begun if last is None else last
         silent, provisional = max(final - since, 0), max(now - max(final, since), 0)
         if self.trigger is None or self.losses is None:
-            return SenderStatus(last, silent, provisional, 0, 1.0, self.timeout)
+            return SenderStatus(last, silent, provisional, missed=0, chance=1.0, timeout=self.timeout)
         step = None if last is None else int(last)
         missed = count_missed_heartbeats(self.trigger, step, int(silent), int(final))
         apart = 1 if self.trigger.heartbeat is None else int(self.trigger.heartbeat)
-        return SenderStatus(
-            last, silent, provisional, missed, self.losses.probability_all_lost(apart, missed), self.timeout
-        )
+        chance = self.losses.probability_all_lost(apart, missed)
+        return SenderStatus(last, silent, provisional, missed=missed, chance=chance, timeout=self.timeout)
 
 
 def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: int, final: int) -> int:
@@ -126,6 +125,7 @@ def count_missed_heartbeats(trigger: AbstractTrigger, last: int | None, silent: 
     one on an event that was lost too only delays the next, so that at least one falls into each `heartbeat` steps.
     """
     if isinstance(trigger, Periodic):
+        # Due in the steps phase, phase + period, ...: those up to `final` less those up to the silence's begin.
         period, phase = int(trigger.period), int(trigger.phase)
         return (final - phase) // period - (final - silent - phase) // period
     first_due = int(last is None and silent > 0 and trigger.needs_reference)

@@ -74,7 +74,7 @@ class SortedRows:
     def judge_event(self, event: CheckedEvent, key: Key, watermark: float, ahead: float) -> Verdict:
         """Return the verdict on an event whose row has this key, where rows before the watermark are final.
 
-        `ahead`: how much later than its arrival an event may be dated.
+        The base is the newest row that is final. `ahead`: how much later than its arrival an event may be dated.
         """
         if event.time > event.arrival + ahead:
             return "future"
@@ -83,17 +83,18 @@ class SortedRows:
         base, _ = self.find_base(watermark)
         index, row = self.find_row(key)
         values_held = None if row is None else row.events.get(event.name)
+        # A final row takes no event. Of the base it is still known which events it has: a copy of one is no late one.
         if index < base or (index == base and values_held is None):
             return "late"
-        if row is None:
+        if row is None:  # the first event of its row
             return "used"
         if values_held is not None:
             return "duplicate" if np.array_equal(values_held, event.values, equal_nan=True) else "conflict"
         # Two events of a node in one row are fine where they fill different components: NaN, which is not equal to
         # itself, is nothing yet.
-        there = row.numbers[self.columns_by_node[event.node_index]]
-        both = any(old == old and new == new for old, new in zip(there, event.values, strict=True))
-        return "conflict" if both else "used"
+        numbers_held = row.numbers[self.columns_by_node[event.node_index]]
+        would_overwrite = any(old == old and new == new for old, new in zip(numbers_held, event.values, strict=True))
+        return "conflict" if would_overwrite else "used"
 
     def find_row(self, key: Key) -> tuple[int, HeldRow | None]:
         """Return the index of the row with this key, and the row if it exists."""

@@ -73,20 +73,18 @@ class Stream:
         """
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
-        # The sensor and the channel that the filter believes in, where it says so.
-        self.filter, world = filter, filter.premise
-        sensor, channel = (None, None) if world is None else (world.sensor, world.channel)
+        # The sensor and the channel that the filter was made for, where it says so.
+        self.filter, premise = filter, filter.premise
+        sensor, channel = (None, None) if premise is None else (premise.sensor, premise.channel)
         # What is refused before the filter, and how many values of each component were.
         self.limits = make_limits(filter.received, limits, invalid, stuck, sensor, channel)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
-        # Runs of equal readings; watched where no rule refuses them, and the sender does not decide when to send.
+        # Runs of equal readings. They are watched where no rule refuses them; a sender that decides when to send has a
+        # reason for the values that come.
         self._repeats = Repeats()
-        has_rule = self.limits is not None and self.limits.stuck is not None
-        self._watch = (
-            None
-            if has_rule or find_deciding_sender(filter)
-            else RepeatWatch.for_sensor(sensor, channel, filter.received)
-        )
+        refuses_stuck = self.limits is not None and self.limits.stuck is not None
+        is_watched = not refuses_stuck and not find_deciding_sender(filter)
+        self._watch = RepeatWatch.for_sensor(sensor, channel, filter.received) if is_watched else None
         self.steps = 0  # done so far
         self._last = -1  # the step of a sender's newest value
         self._beyond = 0  # unexpected measurements in a row
@@ -133,7 +131,7 @@ class Stream:
         if not stepper.step(z, u, k):
             self._refuse_or_accept(z, u)
         self.steps, self._inputs = k + 1, u
-        # The newest step at which a value of a sender came that decides when to send.
+        # Note the step if a value came of a sender that decides when to send: its silence counts from there.
         if compiled.values and not np.isnan(z[: compiled.values]).all():
             self._last = k
         # What was refused, and warnings: of readings, of the filter's state, of angles. What is unexpected is counted.
@@ -197,7 +195,7 @@ class Stream:
         found_before, watch = self._repeats.found, self._watch
         if watch is None:
             return
-        self._repeats = watch.follow(z.tolist(), self._repeats)
+        self._repeats = watch.extend_runs(z.tolist(), self._repeats)
         for i, count in enumerate(self._repeats.found if self._repeats.found != found_before else ()):
             if count == 1 and not (found_before and found_before[i]):
                 said = watch.describe(i, f"received number {i}", self._repeats)
@@ -225,15 +223,17 @@ class Stream:
     def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
         """Raise ValueError if the step's inputs u or measurement z are implausible; else accept the flagged step.
 
-        In this case only the filter is to blame. The state is that before the step.
+        It is accepted where inputs of zero would be implausible too: then only the filter is to blame. The stepper
+        still has the state before the step.
         """
-        # A step is flagged for infinite measurements and inputs that are no numbers too.
+        # A step is flagged also for infinite measurements and inputs that are no numbers: these raise here.
         self.filter.check_measurement(z)
         self.filter.check_input(u)
-        stepper, (distance, _, reason, _) = self._stepper, self._stepper.judgement.tolist()
+        stepper = self._stepper
+        judgement = Judgement(*stepper.judgement.tolist())
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
-            # Are inputs of zero implausible too, without a measurement? Then it is not the inputs that are wrong.
+            # Try inputs of zero without a measurement, and take the step back.
             state = stepper.state
             stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
             why_zeros = Judgement.why_inputs(stepper.judgement[None])
@@ -244,8 +244,8 @@ class Stream:
                     "plausible ones",
                     f"{u.tolist()}: {why}{self._name_faulty_function(u)}",
                 )
-        if reason > 0:
-            why = Judgement.describe(reason, distance) + self._name_faulty_function(u)
+        if judgement.reason > 0:
+            why = Judgement.describe(judgement.reason, judgement.distance) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, since zeros may have been tried in between
         stepper.accept()

@@ -88,6 +88,7 @@ class Timeline:
         self._program = shared_program(network)
         if self._program.dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
+        # Such a plant takes other steps where a prediction stops in between.
         if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         # A fleet of one plant, and a slot of its table to predict into.
@@ -108,7 +109,7 @@ class Timeline:
         return {"network": self.network, "saved": pack(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
-        vars(self).update(vars(self._resume(stored["network"], *unpack_snapshot(stored["saved"]))))
+        vars(self).update(vars(self._resume_from(stored["network"], *unpack_snapshot(stored["saved"]))))
 
     @property
     def engine(self) -> str:
@@ -181,13 +182,13 @@ class Timeline:
         event = screened.event
         verdict = self._fleet.take_event(plant, event, arrival is not None)
         if verdict == "used":
-            row, _ = plant.changes[-1]
+            row, _ = plant.changes[-1]  # that which holds the event now
             why = screened.why if screened.is_empty else self._why_implausible(event, row)
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
                 self._fleet.undo_events(plant, clock_before)
-                self._fleet.step([plant])
+                self._fleet.step_changed_rows([plant])
             else:
                 for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
@@ -203,9 +204,9 @@ class Timeline:
         Inputs are also judged over one unit of time after them.
         """
         fleet, plant = self._fleet, self._plant
-        fleet.step([plant])
+        fleet.step_changed_rows([plant])
         why = self._judges.find_implausible([Candidate(0, plant, event, row)]).get(0)
-        if why is None and event.node_index < 0 and self._program.dt is not None:
+        if why is None and event.is_inputs and self._program.dt is not None:
             after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
             why = self._judges.explain_inputs(after[0])
         return why
@@ -276,7 +277,7 @@ class Timeline:
         They are the filtered estimates after the row, in order of time. Without calls, the last 2 `capacity` of them
         are kept.
         """
-        time, outputs = self._finals.take()
+        time, outputs = self._finals.take_all()
         return Record(time, self.network.states, None, {}, self._arrange_outputs(outputs))
 
     def save(self) -> bytes:
@@ -291,7 +292,7 @@ class Timeline:
 
     def _pack_state(self) -> tuple[dict[str, object], dict[str, np.ndarray]]:
         """Return the whole state: options, the plant, and what is final."""
-        time, outputs = self._finals.take()
+        time, outputs = self._finals.take_all()
         self._finals.add(time, outputs)
         plant = np.frombuffer(pack_plant(self._plant, self._fleet), np.uint8)
         arrays = {"plant": plant, "final.time": time, "final": outputs}
@@ -315,9 +316,9 @@ class Timeline:
         head, arrays = unpack_snapshot(data)
         mine, other = shared_program(network).identity, head.get("of", {})
         if accept_changes and mine != other:
-            return cls._resume(network, head, cls._carry_over(network, head, arrays))
+            return cls._resume_from(network, head, cls._carry_over(network, head, arrays))
         check_same_network("snapshot", mine, other, SAME)
-        return cls._resume(network, head, arrays)
+        return cls._resume_from(network, head, arrays)
 
     @classmethod
     def _carry_over(
@@ -355,7 +356,7 @@ class Timeline:
         return {"plant": plant, "final.time": time, "final": final}
 
     @classmethod
-    def _resume(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
+    def _resume_from(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
         """Return a timeline of the network that goes on from a saved state: head and arrays of its snapshot."""
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # the warning was given when the timeline was made
@@ -390,7 +391,7 @@ class Timeline:
         if read:
             outputs = self._outputs_after([row.slot for row in read])
             self._finals.add(np.array([row.key[0] for row in read]), outputs)
-            self._gates.add(outputs)
+            self._gates.count_weights_of_zero(outputs)
         self._fleet.free_slots(results)
 
     def _arrange_outputs(self, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:

@@ -95,6 +95,7 @@ class Arrivals:
         period = float(np.median(intervals))
         if not self.of_messages and period < SLOWER * spacing:
             return None
+        # How far each interval is from the nearest whole number of periods, of one at least, in periods.
         off_whole = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
         return period if np.mean(off_whole <= NEAR) >= REGULAR else None
 
@@ -301,7 +302,7 @@ def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"
     if receiver.channel.remembers or not receiver.channel.erases:
         return None
     try:
-        sets = receiver.channel.list_outcomes()
-    except InputError:  # more sets of losses than are listed
+        outcomes = receiver.channel.list_outcomes()  # each set of components that may arrive together
+    except InputError:  # more sets than are listed
         return None
-    return np.asarray(np.sum([float(o.probability) * o.arrived for o in sets], axis=0))
+    return np.asarray(np.sum([float(outcome.probability) * outcome.arrived for outcome in outcomes], axis=0))

@@ -212,12 +212,14 @@ def _compute_inverse_roots(s: Float[np.ndarray, "time m m"], arrived: Float[np.n
 
     Zero also where S is not finite; a direction in which S has no positive eigenvalue counts nothing.
     """
-    both = np.asarray(arrived[:, :, None] & arrived[:, None, :])
+    both_arrived = np.asarray(arrived[:, :, None] & arrived[:, None, :])  # components i and j of a row
+    # Ones on the diagonal stand for what did not arrive, or is not finite, so that all rows are inverted at once.
     eye = np.eye(s.shape[1])
-    filled = np.where(both, s, eye)
+    filled = np.where(both_arrived, s, eye)
     is_finite = np.asarray(np.isfinite(filled).all(axis=(1, 2)))
     filled = np.where(is_finite[:, None, None], filled, eye)
+    # S = V diag(values) V', so that S^(-1/2) = V diag(values^(-1/2)) V'.
     values, vectors = np.linalg.eigh(filled)
-    root = np.where(values > 0, np.abs(values), np.inf) ** -0.5
-    inverse = np.einsum("tij,tj,tkj->tik", vectors, root, vectors)
-    return np.asarray(np.where(both & is_finite[:, None, None], inverse, 0.0))
+    inverse_roots = np.where(values > 0, np.abs(values), np.inf) ** -0.5
+    inverse = np.einsum("tij,tj,tkj->tik", vectors, inverse_roots, vectors)
+    return np.asarray(np.where(both_arrived & is_finite[:, None, None], inverse, 0.0))

@@ -32,6 +32,9 @@ def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.nda
     there = ~np.isnan(squares) & ~np.isnan(expected)
     if not there.any() or not expected[there].any():
         return np.nan, np.nan
-    mean = float(expected[there].mean())
-    size = float(squares[there].mean()) / mean
-    return size, average_correlated(np.where(there, squares - size * expected, np.nan))[1] / mean
+    mean_expected = float(expected[there].mean())
+    ratio = float(squares[there].mean()) / mean_expected
+    # Of a ratio of means, to first order: the standard error of the mean of (square - ratio expected), over that of
+    # expected.
+    _, residual_error = average_correlated(np.where(there, squares - ratio * expected, np.nan))
+    return ratio, residual_error / mean_expected

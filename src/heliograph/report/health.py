@@ -118,7 +118,7 @@ class Health:
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
         lines += [] if self.apart is None else [say_apart(self.apart)]
-        lines += [self.time_unit] * bool(self.time_unit)
+        lines += [self.time_unit] if self.time_unit else []
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
     def describe_held_outputs(self) -> dict[tuple[str, str], str]:
@@ -176,7 +176,7 @@ class Health:
         if self._has_memory(health, health.test):
             yield say_memory(name, health.test)
 
-    def _level(self) -> float:
+    def _level_of_one_test(self) -> float:
         """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
         return FALSE / sum(filter.test is not None for filter in self.filters)
 
@@ -186,7 +186,7 @@ class Health:
         Each output is judged by itself, since a mean over outputs hides the one that is wrong; all together where none
         is wrong by itself. `test`: that of the filter's innovations.
         """
-        name, level = f"{health.node}/{health.filter}", self._level()
+        name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
         # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
@@ -208,7 +208,7 @@ class Health:
 
     def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
         """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
-        level = self._level() / off.squares.shape[1]
+        level = self._level_of_one_test() / off.squares.shape[1]
         for column in off.squares.T:
             numbers = int(np.count_nonzero(~np.isnan(column)))
             if numbers and compare_with_claim(*average_correlated(column), numbers, level):
@@ -226,7 +226,7 @@ class Health:
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
         probability = 2 * min(test.p_value, test.p_value_of_all)  # two tests share the level
-        return probability < self._level() and test.predictable - by_chance >= LEAST_SHARE
+        return probability < self._level_of_one_test() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Yield which outputs a filter that weighs left out most, in the words of `heliograph.run`."""
@@ -394,7 +394,7 @@ def _compare_size(
     if np.all(expected == 1):
         return test
     there = ~np.isnan(white)
-    count = np.maximum(there.sum(axis=1), 1)
-    squares, means = (np.where(there, a, 0.0).sum(axis=1) / count for a in (white**2, expected))
+    count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
+    squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
     power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
     return replace(test, power=power, power_error=error)

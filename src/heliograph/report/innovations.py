@@ -164,11 +164,12 @@ def _make_output_cells(output: OutputHealth) -> list[str]:
     if output.weighs:
         low, high = 100 * summary.share.low, 100 * summary.share.high
         doubted = f"{summary.down_weighted} ({low:.2g} to {high:.2g} %)"
-    half = (summary.bias_high - summary.bias_low) / 2
+    half = (summary.bias_high - summary.bias_low) / 2  # of the 95 % interval, which is 1.96 standard errors
     error = half / 1.96
     bias = f"{round_to(summary.bias, error)} ± {round_to(half, error)}"
     size = f"{round_to(judged.size, judged.size_error)} ± {round_to(1.96 * judged.size_error, judged.size_error)}"
-    remarks = ["to blame"] * judged.to_blame + ["stuck"] * (judged.held is not None)
+    possible_remarks = (("to blame", judged.to_blame), ("stuck", judged.held is not None))
+    remarks = [words for words, holds in possible_remarks if holds]
     received = f"{summary.received} of {summary.expected}"
     return [output.name, received, doubted, bias, size, ", ".join(remarks)]
 

@@ -158,6 +158,7 @@ def _find_relied_on(network: Network) -> dict[str, set[str]]:
     The first of several such. Others, such as one that takes the mean of a random gain for it, are there to be compared
     with.
     """
+    # Names of the filters whose estimates a fusion joins, in a centre or among neighbours.
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
     relied_on = {}
     for node, receiver in network.nodes.items():
@@ -293,7 +294,7 @@ class RecentOutputs:
         """Return what the newest rows of each filter say of each of its outputs."""
         results = []
         for (node, name), rows in self._rows.items():
-            innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))
+            innovations = Weighed(*np.moveaxis(np.array(rows), 1, 0))  # rows hold (value, variance, weight) each
             count = innovations.value.shape[1]
             names = list(self.names.get((node, name)) or [str(i + 1) for i in range(count)])
             unknown = np.full(innovations.value.shape, np.nan)  # what was received is not kept

@@ -231,6 +231,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
     # What was not used, in words.
     for line in [] if reader is None else reader.left_out():
         _say(line)
+    # A store may have used the same messages in an earlier run: say so, as nothing else shows it.
     if has_plants and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
@@ -314,9 +315,9 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap
     from heliograph.serving.storage.owner import name_of_process
     from heliograph.serving.storage.store import Store
 
-    # The store is checked once, before any part is served.
-    fleet = Fleet(program, settings.options)
-    checked = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), asyncio.Event())
+    # The store is checked once, before any part is served. Only the end of the process stops the wait for it.
+    fleet, never = Fleet(program, settings.options), asyncio.Event()
+    checked = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet), never)
     assert isinstance(checked, Store)  # the settings require one
     checked.close()
 
@@ -350,7 +351,8 @@ async def _serve_part(
     store = Store(str(settings.store), identity(fleet), f"part {part.number} of {part.of}", opened=checked)
     try:
         service = wrap(Service(fleet, store, _say, None, settings.forecast, settings.thresholds))
-        # A silent step is not used by processes that share plants; a timeout is told all the same.
+        # Processes that share plants do not step them through silence; that a sender has timed out is published all the
+        # same, where there are timeouts.
         patience = SHORTEST if fleet.shortest_timeout < inf and not fleet.deciding else None
         await serve_until(stop, WaitingService(service, stop), make_transport(settings.broker, part), patience)
     finally:

@@ -38,7 +38,7 @@ class EstimateWriter:
         # Columns of the outputs that decide whether the template fits: variances, reasons not to use what arrived, and
         # all that has to be finite.
         claimed = [columns.covariance for columns in program.filter_columns if columns.claim != "none"]
-        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # of a covariance row by row
+        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # the diagonal, row after row
         self._reasons = [
             columns.judgement.reason for columns in program.filter_columns if columns.judgement is not None
         ]
@@ -76,19 +76,20 @@ class EstimateWriter:
         """
         if not rows:
             return []
-        # The template fits rows whose numbers are finite, variances not negative, and nothing refused.
+        # The template fits rows whose numbers are finite, variances not negative, and which used all that had arrived.
         fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
         fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
-        # All numbers as texts at once, row after row; then by place in the template, with a text for each row.
-        width, numbers = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
-        columns: list[Sequence[bytes | int]] = [numbers[i::width] for i in range(width)]
-        for i in self._whole:
-            columns[i] = outputs[:, self._order[i]].astype(int).tolist()
-        # Before them kind, plant and time of each row.
+        # The texts of all numbers at once, row after row, in the order in which a line has them.
+        place_count, texts = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
+        # By place in a line, what each row has there: every `place_count`-th text. Whole numbers have no point.
+        by_place: list[Sequence[bytes | int]] = [texts[place::place_count] for place in range(place_count)]
+        for place in self._whole:
+            by_place[place] = outputs[:, self._order[place]].astype(int).tolist()
+        # Before them kind, plant and time of each row; then a line for each row by the template.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
         head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
-        lines = [*map(self._template.__mod__, zip(*head, *columns, strict=True))]
-        # Rows that the template does not fit, filter by filter.
+        lines = [self._template % of_row for of_row in zip(*head, *by_place, strict=True)]
+        # In place of those of rows that the template does not fit, lines that are written filter by filter.
         for i in np.flatnonzero(~fits).tolist():
             estimates = self._write_estimates(outputs[i].tolist())
             lines[i] = HEAD % tuple(column[i] for column in head) + encode_line(estimates) + b"}"
@@ -109,8 +110,8 @@ class EstimateWriter:
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row
         # What is no number, or has a negative variance, is no estimate that claims something.
-        claim = columns.claim
-        if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(covariance[:: n + 1]) < 0):
+        claim, variances = columns.claim, covariance[:: n + 1]
+        if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(variances) < 0):
             claim = "none"
         rows = None if columns.claim == "none" else [covariance[i : i + n] for i in range(0, n * n, n)]
         results: dict[str, object] = {"mean": mean, "covariance": rows, "claim": claim}

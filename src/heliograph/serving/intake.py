@@ -90,7 +90,8 @@ class BatchIntake:
         """
         self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
         outcomes = [Outcome()] * len(messages)
-        # One plant after another, so that its memory is near; the messages of a plant in their order.
+        # One plant after another, so that its memory is near; the messages of a plant in their order. Those that could
+        # not be read have no plant, and stand under "".
         numbers_by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
             name = plant_of(message)
@@ -109,12 +110,11 @@ class BatchIntake:
 
     def _refuse_implausible(self) -> set[str]:
         """Step what was taken, note what is implausible in `_refused`, and restore its plants; return their names."""
-        self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
+        self.fleet.step_changed_rows({taken.plant.name: taken.plant for taken in self._taken}.values())
         restored = set[str]()
         for i, why in self._judges.find_implausible(self._taken).items():
             taken = self._taken[i]
-            is_inputs = taken.event.node_index < 0
-            self._refused[taken.number, is_inputs] = why
+            self._refused[taken.number, taken.event.is_inputs] = why
             restored.add(taken.plant.name)
         for name in restored:
             self._restore_plant(name)
@@ -158,17 +158,20 @@ class BatchIntake:
         # Values beyond limits do not count as received; an event of such values only is implausible.
         screened = self.fleet.screen_event(message.node, timed.event, plant)
         why, why_inputs = screened.why if screened.is_empty else "", None
-        if self._refused:  # as most often nothing is
-            why = self._refused.get((number, timed.event.node_index < 0)) or why
+        # What an earlier round found implausible, in the event or in the inputs that came with it; most often nothing.
+        if self._refused:
+            why = self._refused.get((number, timed.event.is_inputs)) or why
             why_inputs = self._refused.get((number, True)) if timed.inputs is not None else None
         # A new plant begins with a message that is plausible and of a right clock.
         if plant is None:
             if timed.at > timed.arrival + self.fleet.options.ahead:
                 return Outcome(verdict="future")
-            if why and (timed.inputs is None or why_inputs):
+            nothing_is_plausible = why and (timed.inputs is None or why_inputs)
+            if nothing_is_plausible:
                 return Outcome(verdict="implausible", why=why)
-            is_dated = message.arrival is not None  # its arrival has a time by another clock
-            leap = make_first_leap(timed.arrival, ARRIVAL) if is_dated else make_first_leap(timed.at, message.node)
+            # Its first moment counts as a leap in time, by one clock that may be wrong: that of arrivals where given.
+            has_arrival = message.arrival is not None
+            leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
             plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
         plant = self._note_before(plant, timed.at)
         # Inputs and measurement are used or refused independently.
@@ -208,7 +211,7 @@ class BatchIntake:
         event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
         if message.inputs is not None:
             inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
-        return TimedEvents(at, arrival, clock, origin, event, inputs)
+        return TimedEvents(at=at, arrival=arrival, clock=clock, origin=origin, event=event, inputs=inputs)
 
     def _count_unread(self, unread: UnreadMessage) -> PlantState | None:
         """Count a message that came but cannot be used, and what it is refused for; it is not counted as lost.
@@ -237,10 +240,10 @@ class BatchIntake:
         """
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
-            self._before[plant.name] = PlantBefore(False, (begun, None), {})
+            self._before[plant.name] = PlantBefore(known=False, clock=(begun, None), links={})
         elif plant.name not in self._before:
             links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
-            self._before[plant.name] = PlantBefore(True, plant.clock, links)
+            self._before[plant.name] = PlantBefore(known=True, clock=plant.clock, links=links)
         return plant
 
     def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
@@ -255,7 +258,8 @@ class BatchIntake:
         future of the clock on the wall, with which the message agrees.
         """
         plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
-        if plant is None or isinstance(message.time, datetime) != (plant.origin is not None):
+        has_other_kind_of_time = plant is not None and isinstance(message.time, datetime) != (plant.origin is not None)
+        if plant is None or has_other_kind_of_time:  # such a message is refused later
             return plant
         at = self._time_as_number(message.time, plant.origin, plant.name)
         # The clock that decides: that of arrivals, where one was given, else the sender's; and what it says.
@@ -270,7 +274,8 @@ class BatchIntake:
         # The clock on the wall agrees with the message, and not with the plant.
         if plant.origin is not None:
             now = self._time_as_number(wall, plant.origin, plant.name)
-            if plant.confirmed > now + longest_gap and abs(at - now) <= longest_gap:
+            is_plant_ahead, is_message_right = plant.confirmed > now + longest_gap, abs(at - now) <= longest_gap
+            if is_plant_ahead and is_message_right:
                 return None
         return plant
 
@@ -285,10 +290,9 @@ class BatchIntake:
             plant.version = self._anew[name] = old.version
             events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
             self.replaced.append((old, events))
-            for node, sequence, time in events:
-                plant.link_counts(INPUTS if node < 0 else self.fleet.network.names[node]).count(
-                    "future", sequence, time
-                )
+            for node_index, sequence, time in events:
+                node = INPUTS if node_index < 0 else self.fleet.network.names[node_index]
+                plant.link_counts(node).count("future", sequence, time)
             self._before.pop(name, None)
             self._taken = [taken for taken in self._taken if taken.plant is not old]
             self.fleet.end_plant(old)

@@ -95,9 +95,9 @@ async def serve_until(
     """
     ending = StoppableWork(stop)
     try:
-        await _publish(service, transport, service.unpublished(), ending)
-        ended = await _serve(service, transport, ending, patience)
-        await _publish(service, transport, await ending.call(service.finish, ended), ending)
+        await _publish_in_time(service, transport, service.unpublished(), ending)
+        ended = await _serve_batches(service, transport, ending, patience)
+        await _publish_in_time(service, transport, await ending.call(service.finish, ended), ending)
         await ending.call(service.finish, False)
     except AbandonedError:
         LOG.warning("stopped while it computed: the messages that it was taking are not committed, and come again")
@@ -105,7 +105,9 @@ async def serve_until(
         await transport.close()
 
 
-async def _serve(service: BatchService, transport: Transport, ending: StoppableWork, patience: float | None) -> bool:
+async def _serve_batches(
+    service: BatchService, transport: Transport, ending: StoppableWork, patience: float | None
+) -> bool:
     """Receive, take and publish until a stop or the transport's end; return whether it was the latter."""
     stop = ending.stop
     while not stop.is_set():
@@ -113,7 +115,7 @@ async def _serve(service: BatchService, transport: Transport, ending: StoppableW
         waiting = asyncio.ensure_future(_await_unless_stopped(stop, transport.receive()))
         try:
             while not (await asyncio.wait({waiting}, timeout=patience))[0]:
-                await _publish(service, transport, await ending.call(service.take, []), ending)
+                await _publish_in_time(service, transport, await ending.call(service.take, []), ending)
         finally:
             waiting.cancel()
         batch = waiting.result()
@@ -121,11 +123,11 @@ async def _serve(service: BatchService, transport: Transport, ending: StoppableW
             return not stop.is_set()
         outputs = await ending.call(service.take, batch.payloads)
         await batch.acknowledge()
-        await _publish(service, transport, outputs, ending)
+        await _publish_in_time(service, transport, outputs, ending)
     return False
 
 
-async def _publish(
+async def _publish_in_time(
     service: BatchService, transport: Transport, outputs: Sequence[Output], ending: StoppableWork
 ) -> None:
     """Publish outputs; what a reader does not take in the time after a stop is published after a restart."""

@@ -62,8 +62,9 @@ class NeighbourMessenger:
         for i, row in enumerate(held[1:], 1):
             after = held[i + 1] if i + 1 < len(held) else None
             followed_before = after is not None and id(after) not in new and id(row) not in new
-            sent = followed_before or measured_before.get(id(row), self._has_measurement(row.events))
-            if (self._has_measurement(row.events) or after is not None) and not sent:
+            was_due_before = followed_before or measured_before.get(id(row), self._has_measurement(row.events))
+            is_due = self._has_measurement(row.events) or after is not None
+            if is_due and not was_due_before:
                 due.append(row)
         return due
 

@@ -82,23 +82,25 @@ class ForecastPublisher:
         far ahead is in seconds where the messages have dates, else in the unit of their time.
         """
         results: list[list[Ahead]] = [[] for _ in rows]
-        limit = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
-        covered = [i for i, row in enumerate(rows) if row.key[0] <= limit]
+        latest_time = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
+        times = [float(row.key[0]) for row in rows]
+        covered = [i for i, time in enumerate(times) if time <= latest_time]  # numbers of the rows that have forecasts
         if not covered:
             return results
         # Forecasts by node and filter, each of all covered rows; then what is published of them.
-        slots, times = [rows[i].slot for i in covered], np.array([float(rows[i].key[0]) for i in covered])
-        start = ForecastStart(make_row_origin(self._fleet, slots, times))
+        slots = [rows[i].slot for i in covered]
+        start = ForecastStart(make_row_origin(self._fleet, slots, np.array([times[i] for i in covered])))
         forecasts = heliograph.forecast(start, self.horizons, inputs="held")
         assert isinstance(forecasts, dict)  # of a network
         bodies = {
             node: {name: _write_forecasts(forecast) for name, forecast in filters.items()}
             for node, filters in forecasts.items()
         }
-        for number, i in enumerate(covered):
+        # Each covered row: `i` is its number among `rows`, `place` that among the forecasts.
+        for place, i in enumerate(covered):
             if self._thresholds:
-                self._add_crossings(rows[i], forecasts, bodies, number)
-            results[i] = self._arrange_by_horizon(float(rows[i].key[0]), bodies, number)
+                self._add_crossings(rows[i], forecasts, bodies, place)
+            results[i] = self._arrange_by_horizon(times[i], bodies, place)
         return results
 
     def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:

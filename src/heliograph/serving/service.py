@@ -42,11 +42,11 @@ class BatchStatistics(NamedTuple):
     `lag`: age in seconds of the oldest message, where messages carry dates; else the seconds that the batch took.
     """
 
-    messages: int
-    outputs: int
-    took: float
-    committed: float
-    lag: float
+    messages: int = 0
+    outputs: int = 0
+    took: float = 0.0
+    committed: float = 0.0
+    lag: float = 0.0
 
 
 class Service:
@@ -81,12 +81,12 @@ class Service:
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         # Counts over all batches, and of the last one.
-        self.malformed, self.known, self.last = 0, 0, BatchStatistics(0, 0, 0.0, 0.0, 0.0)
+        self.malformed, self.known, self.last = 0, 0, BatchStatistics()
         # What takes messages, and what makes outputs: estimates, messages to neighbours, what silence means, forecasts.
         self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
-        # What is said of plants, and to whom: of an implausible message only once, after which `_say` is None.
+        # What is said of plants: doubts by `_doubt`, the first implausible message by `_say`, which then becomes None.
         self._angles, self._remarks, self._held = FleetAngles(fleet), FleetRemarks(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
@@ -138,7 +138,7 @@ class Service:
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
         # Rows that are final by the clock, and events whose clocks it shows to be wrong.
-        due = self._silence.find_due(self.plants.values(), now)
+        due = self._silence.find_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
         finalised = self.fleet.finalise_plants(plant for plant, _ in due)
@@ -276,7 +276,7 @@ class Service:
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):
             if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
-            # Of a plant that is damaged in the store.
+            # Of a plant that is damaged in the store; a text is a message that could not be read, of no known plant.
             damage = self._damage.get(plant_of(message) or "")
             if damage and not isinstance(message, str):
                 entries.append(refuse_message(message, "damaged", damage))
@@ -284,7 +284,7 @@ class Service:
             # Not read, or of another kind than its plant expects.
             if isinstance(message, str | UnreadMessage) or outcome.verdict is None:
                 malformed += 1
-                is_explained = isinstance(payload, str | UnreadMessage)
+                is_explained = isinstance(payload, str | UnreadMessage)  # by who read it: then it need not be shown
                 why = outcome.why if is_explained else f"{outcome.why}: {show_value(payload)}"
                 entries.append(refuse_message(message, "malformed", why))
                 continue
@@ -392,7 +392,7 @@ class Service:
         """Return the estimates after these rows as lines of JSON, one each; `kind` is "final" or "provisional"."""
         moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
-        return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
+        return self._writer.write_lines(kind, moments, self.fleet.outputs_after([row.slot for _, row in rows]))
 
     def _time_in_messages(self, plant: PlantState, at: float) -> float | str:
         """Return the time of a row as messages have it."""

@@ -181,7 +181,7 @@ class PlantMigration:
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
-        self.fleet.step(plants.values())
+        self.fleet.step_changed_rows(plants.values())
         results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
             self.fleet.end_plant(plant)
@@ -219,7 +219,7 @@ class PlantMigration:
         parts = PlantParts.from_bytes(stored, self._count_columns_before())
         rows = self._select_rows(parts, index_here)
         table = self._translate_table(parts.table[[row.number_before for row in rows]], index_here)
-        assert table.shape[1] == self.fleet.pool.table.shape[1]
+        assert table.shape[1] == self.fleet.pool.table.shape[1]  # rows as this network has them
         events, times, values = self._translate_events(parts, rows, index_here)
         links = {name: link for name, link in parts.head["links"].items() if name in (*kept, INPUTS)}
         return PlantParts(
@@ -248,7 +248,7 @@ class PlantMigration:
         joint, always_kept = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = []
         for i, (node, sequence) in enumerate(parts.keys.tolist()):
-            if i < always_kept or joint or node in index_here:
+            if i < always_kept or joint or node in index_here:  # joint: rows are of no single node
                 node_here = node if joint or node == BEFORE else index_here.get(node, BEFORE)
                 rows.append(_MovedRow(float(parts.table[i, -1]), node_here, sequence, i))
         return [*rows[:always_kept], *sorted(rows[always_kept:])]
@@ -321,12 +321,13 @@ class PlantMigration:
         numbers = np.full((len(numbers_before), received + given + 1), np.nan)
         # Inputs and time come last in both.
         numbers[:, received:] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
-        # Node i there, j here: its first column and that of the node behind it.
+        # The first column of each node, and the end of the last one's: node `there` has as many as it has `here`.
         starts_before = np.cumsum([0, *self._old["nodes"].values()])
         starts = np.cumsum([0, *(network.nodes[name].received for name in network.names)])
-        for i, j in index_here.items():
-            if i >= 0:  # -1 stands for the inputs
-                numbers[:, starts[j] : starts[j + 1]] = numbers_before[:, starts_before[i] : starts_before[i + 1]]
+        for there, here in index_here.items():
+            if there >= 0:  # -1 stands for the inputs
+                before = numbers_before[:, starts_before[there] : starts_before[there + 1]]
+                numbers[:, starts[here] : starts[here + 1]] = before
         return numbers
 
 
@@ -344,7 +345,7 @@ def list_changes(mine: Identity, other: Identity) -> list[str]:
 
     These are options and versions, nodes and filters, numbers of the parts, and functions where nothing else has.
     """
-    # Entries of the identities that are words as they stand: options, versions, nodes, filters.
+    # First the entries that are words and can be shown as they stand: options, versions, nodes, filters.
     not_words = (DESCRIPTION, "what is computed", "layout of the store")
     lines = [
         f"{name}: {other.get(name, 'none')} -> {mine.get(name, 'none')}"
@@ -360,7 +361,8 @@ def list_changes(mine: Identity, other: Identity) -> list[str]:
             # Of an array longer than MOST only a hash is known.
             if not lines and mine.get(f"numbers of {name}") != other.get(f"numbers of {name}"):
                 lines.append(f"{name}: numbers of a long array")
-    # Of a function only the program is known that it is compiled to.
+    # Of a function only the program that it is compiled to is known, which other changes change too: it is named where
+    # there is none of these.
     if not lines and mine.get("what is computed") != other.get("what is computed"):
         lines.append("functions of the network")
     return lines

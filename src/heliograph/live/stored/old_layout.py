@@ -141,6 +141,7 @@ def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray
     and is set to that.
     """
     n = covariance.shape[-1]
+    # What is left of P after the columns eliminated so far, and the variances themselves.
     rest, whole = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
     lower, variances = np.zeros_like(rest), np.zeros_like(whole)
     for j in range(n):

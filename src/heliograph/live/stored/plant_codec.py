@@ -75,20 +75,21 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
     }
     # The row kept from before a leap stands first, where there is one.
     rows = [*([] if plant.kept is None else [plant.kept.row]), *plant.rows.held]
-    # Of each row (node, sequence), of each event (row, node, sequence), one after another; times stand apart.
+    # Whole numbers, one after another: (node, sequence) of each row, and (number of the row, node, sequence) of each
+    # event. Their times are no whole numbers, and stand apart; the time of a row is in the table.
     keys = [number for row in rows for number in row.key[1:]]
-    names = [(i, node, sequence, time) for i, row in enumerate(rows) for node, sequence, time in row.events]
-    events = [number for i, node, sequence, _ in names for number in (i, node, sequence)]
+    events_by_row = [(i, *event) for i, row in enumerate(rows) for event in row.events]
+    events = [number for i, node, sequence, _ in events_by_row for number in (i, node, sequence)]
     table = fleet.pool.table[[row.slot for row in rows]].ravel()
-    times = [time for *_, time in names]
+    times = [time for *_, time in events_by_row]
     values = [value for row in rows for values in row.events.values() for value in values]
     return _pack_parts(head, keys, events, table, times, values)
 
 
 def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
     """Return as bytes the lengths of all parts, the head, and the flat parts (keys, events, table, times, values)."""
-    # Numbers of rows, events and values, from keys (rows, 2), events (events, 3) and values.
-    counts = len(flat[0]) // 2, len(flat[1]) // 3, len(flat[4])
+    keys, events, _, _, values = flat  # of shapes (rows, 2), (events, 3) and (numbers,) once they are unpacked
+    counts = len(keys) // 2, len(events) // 3, len(values)
     arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]
     # Of a table that is mostly zeros a bit for each number, and those that are not zero.
     table = arrays[TABLE]
@@ -103,7 +104,7 @@ def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> by
 
 def _unpack_table(data: bytes, at: int, size: int, kept: int) -> tuple[np.ndarray, int]:
     """Read `size` numbers from place `at`, of which `kept` stand behind a bit for each; return them and the end."""
-    bits = np.frombuffer(data, np.uint8, -(-size // 8), at)
+    bits = np.frombuffer(data, np.uint8, -(-size // 8), at)  # eight of them in a byte, rounded up
     values = np.frombuffer(data, "<f8", kept, at + len(bits))
     array = np.zeros(size)
     array[np.unpackbits(bits, count=size).astype(bool)] = values
@@ -129,7 +130,7 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
         links={node: LinkCounts(*numbers) for node, numbers in head["links"].items()},
         leap=None if head["leap"] is None else _unpack_leap(head["leap"]),
         kept=kept,
-        begun=head.get(BEGUN, max(base.key[0], 0.0)),
+        begun=head.get(BEGUN, max(base.key[0], 0.0)),  # of an older version, the time of the base; no step is below 0
     )
 
 
@@ -160,7 +161,8 @@ def _unpack_leap(parts: Any) -> Leap:
     """
     if isinstance(parts, list):
         time, now, links = parts
-        return Leap(time, time, now, {node: (numbers[2], numbers[4]) for node, numbers in links.items()})
+        moments = {node: (numbers[2], numbers[4]) for node, numbers in links.items()}  # `at` and `latest` of each
+        return Leap(time=time, since=time, now=now, moments=moments)
     moments = {node: (at, latest) for node, (at, latest) in parts["moments"].items()}
     return Leap(**parts | {"moments": moments, "earlier": parts["earlier"] and _unpack_leap(parts["earlier"])})
 

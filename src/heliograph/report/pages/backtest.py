@@ -81,7 +81,7 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
     return Results(
         {"coverage": _draw_coverage(found)},
         lambda drawings: make_backtest_page(found, network, drawings, refit),
-        _summarise(found) | ({"refit": refit} if refit else {}),
+        _list_all_numbers(found) | ({"refit": refit} if refit else {}),
     )
 
 
@@ -112,7 +112,7 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
         for i, filter in enumerate(filters):
             scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]
             shares = [s.coverage[DRAWN] for s in scores]
-            # On a logarithmic axis each filter is shifted by the same length, so that none hides another.
+            # A factor shifts by the same length everywhere on a logarithmic axis: filters stand side by side, about 1.
             shift = np.exp(0.04 * (i - (len(filters) - 1) / 2))
             axes.errorbar(
                 [s.horizon * shift for s in scores],
@@ -193,14 +193,14 @@ def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
     return Table(headers, rows, "**Log score**: the larger the better. **CRPS**: the smaller the better, in its unit.")
 
 
-def _summarise(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
+def _list_all_numbers(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
     """Return all numbers of the backtest for its summary."""
 
-    def plain(value: object) -> Json:
+    def convert_to_json(value: object) -> Json:
         """Return texts and whole numbers as they are, finite numbers as floats, None for all else."""
         if isinstance(value, str | int):
             return value
         return float(value) if isinstance(value, float) and np.isfinite(value) else None
 
-    scores: list[Json] = [{name: plain(value) for name, value in s.row().items()} for s in found.scores]
+    scores: list[Json] = [{name: convert_to_json(value) for name, value in s.row().items()} for s in found.scores]
     return {"rows": found.rows, "horizons": list(found.horizons), "warnings": list_doubts(found), "scores": scores}

@@ -54,7 +54,7 @@ def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Tab
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     not_drawn = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
     # The column on timeouts is there if a sender has one and was silent for longer.
-    past = ["past its timeout"] * bool(health.silences)
+    past = ["past its timeout"] if health.silences else []
     headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
     return [
         Table(headers, [_make_link_cells(health, link) for link in health.links], explained if needs_words else ""),
@@ -70,8 +70,10 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
     gap = "–" if link.due is None else str(link.longest_gap)
-    quiet = health.silences.get(link.node)
-    past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"] * bool(health.silences)
+    past = []  # a column that is there if any sender was silent past its timeout
+    if health.silences:
+        quiet = health.silences.get(link.node)
+        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"]
     says = "may be lost" if link.may_be_lost else "never lost"
     return [name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, says, mean, deviation]
 

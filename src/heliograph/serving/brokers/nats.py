@@ -198,6 +198,7 @@ class Nats:
             connect_timeout=5,
             reconnect_time_wait=FIRST,  # type: ignore[arg-type]  # between attempts at a server that is away
         )
+        # That no server answered says less than the failure itself, by which the caller knows that the server is away.
         try:
             await connecting
         except NoServersError as error:
@@ -216,12 +217,13 @@ class Nats:
         # Another process has taken over this part if our consumer is gone and there is another.
         prefix = f"part-{self.part.number}-of-{self.part.of}-"
         consumers = [each for each in await server.consumers_info(self.stream) if each.name.startswith(prefix)]
-        if self._name and consumers and self._name not in [each.name for each in consumers]:
+        is_taken_over = self._name and consumers and self._name not in [each.name for each in consumers]
+        if is_taken_over:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         # Begin after the last message that any reader acknowledged.
-        acknowledged = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
-        here = self._acknowledged if consumers else 0  # a stream without its consumers is a new one
-        self._acknowledged = min(max([here, *acknowledged]), newest)
+        by_others = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
+        by_us = self._acknowledged if consumers else 0  # a stream without its consumers is a new one
+        self._acknowledged = min(max([by_us, *by_others]), newest)
         # Make the new consumer before the old ones are removed.
         self._name, self._read = prefix + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._configure_consumer())

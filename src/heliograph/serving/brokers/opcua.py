@@ -257,8 +257,9 @@ async def _find_variables(client: Client) -> list[Node]:
     variables, seen, waiting = list[Node](), set[ua.NodeId](), [client.nodes.objects]
     while waiting and len(variables) < MOST:
         for child in await waiting.pop(0).get_children_descriptions():
-            skipped = child.NodeId.NamespaceIndex == 0 or child.NodeId in seen  # 0: the namespace of OPC UA itself
-            if skipped or child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty:
+            is_of_opc_ua = child.NodeId.NamespaceIndex == 0
+            is_property = child.ReferenceTypeId.Identifier == ua.ObjectIds.HasProperty
+            if is_of_opc_ua or is_property or child.NodeId in seen:
                 continue
             seen.add(child.NodeId)
             waiting.append(client.get_node(child.NodeId))

@@ -113,6 +113,8 @@ def row_events(
         steps: whether times are steps.
     """
     for i, (k, at) in enumerate(zip(numbers.tolist(), time.tolist(), strict=True)):
+        # Inputs hold from their event's time on. Those of a row led to it: they are dated at the row before, or, where
+        # times are steps, at the row's own step.
         since = at if steps else before
         if inputs.shape[1] and since is not None:
             yield Event(INPUTS, k, since, inputs[i])
@@ -139,7 +141,7 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
     instance("link", link, Link, "a Link")
     events = items("events", events, "events")
     chance = np.random.default_rng(check_seed("seed", seed))
-    loss, twice = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)
+    loss, duplicates = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)  # probabilities
     scalar("delay", link.delay, 0, FAR)
     after_loss, after_success = _find_loss_probabilities(loss, scalar("run", link.run, 1))
     arriving, lost = list[Event](), dict[str, bool]()  # of each node whether its newest message was lost
@@ -151,7 +153,7 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
         lost_before = lost.get(event.node, chance.random() < loss)
         is_lost = chance.random() < (after_loss if lost_before else after_success)
         lost[event.node] = is_lost
-        copies = 0 if is_lost else 1 + (chance.random() < twice)
+        copies = 0 if is_lost else 1 + (chance.random() < duplicates)
         arriving += [_delay_event(event, chance.exponential(link.delay)) for _ in range(copies)]
     return _sort_events(arriving)
 

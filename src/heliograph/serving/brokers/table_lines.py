@@ -49,9 +49,12 @@ class TableLineReader:
             return False
         if text.startswith(ANNOTATIONS):
             return True
-        known = {*OWN, TOPIC, PAYLOAD, *RowReader(self._network, self._source, False, False).names}
+        rows = RowReader(self._network, self._source, strict=False, ignore_unknown=False)
+        known = {*OWN, TOPIC, PAYLOAD, *rows.names}
         fields = set() if self._translator is None else self._translator.sources.columns
-        return (len(names) > 1 or text.startswith(COMMENTS)) and bool(names & (known | fields))
+        # A single word is a table's only column if a comment sign stands before it; else it may be anything.
+        is_header = len(names) > 1 or text.startswith(COMMENTS)
+        return is_header and bool(names & (known | fields))
 
     def read(self, lines: Sequence[str]) -> list[Payload]:
         """Return the messages of lines.
@@ -193,9 +196,9 @@ def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Messag
     """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
     time = reading.time if reader.numbers else date_of(int(reading.time))
-    came = None
+    stated_arrival = None
     if arrival != reading.time:
-        came = arrival if reader.numbers else date_of(int(arrival))
+        stated_arrival = arrival if reader.numbers else date_of(int(arrival))
     return Message.model_construct(
         plant=reading.plant,
         node=reading.node,
@@ -203,5 +206,5 @@ def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Messag
         time=time,
         values=[None if value != value else value for value in reading.values.tolist()],
         inputs=None,
-        arrival=came,
+        arrival=stated_arrival,
     )

@@ -48,7 +48,9 @@ class Translator:
             raise fail("nodes of other processes", "a list of names", show_value(others))
         self.sources = Sources(table, network, others)
         topics = self.sources.topics
-        self._alone = topics[0] if len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/")) else None
+        # The only topic, if there is one, and it is no pattern (with the wildcards + or #).
+        is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
+        self._alone = topics[0] if is_alone else None
         self._counts, self._stored = Counter[tuple[str, str]](), 0
         # Values of the newest times of each plant and node without a count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
@@ -139,7 +141,7 @@ class Translator:
         """
         results: list[Message | UnreadMessage | str] = []
         try:
-            # Who is online or offline is noted by the sources; such a message has no readings.
+            # A message that only says that a sender is online or offline has no readings: the sources note it.
             if self.sources.take_word(topic, payload, where):
                 return []
             # Messages of unknown topics are counted, whatever they carry.
@@ -176,7 +178,7 @@ class Translator:
         try:
             message = self._make_message(topic, unread.counted, known, repeatable)
             reason = unread.error.reason if isinstance(unread.error, RefusedError) else None
-            return UnreadMessage(message, why, reason, unread.counted.sequence is not None)
+            return UnreadMessage(message, why, reason, counted=unread.counted.sequence is not None)
         except InputError:
             return why
 
@@ -196,12 +198,13 @@ class Translator:
         nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
         reading = self.sources.date_as_original(reading, nanoseconds)
         time = self._date_reading(topic, reading, arrival, is_known=known is not None)
-        # A log's arrival is told; of what comes now, only that it cannot have been measured later than it came.
-        told_arrival: datetime | None = None
+        # A message from a log says when it arrived. One that comes now says so only if its time is later than now: it
+        # cannot have been measured after it came.
+        stated_arrival: datetime | None = None
         if reading.time is not None and isinstance(time, datetime):
-            is_log = known is not None and not repeatable
-            told_arrival = arrival if time > arrival or is_log else None
-        # Checked already, and dates are no texts here.
+            is_from_log = known is not None and not repeatable
+            stated_arrival = arrival if time > arrival or is_from_log else None
+        # Made without a check: the parts are checked already, and dates are no texts here. NaN becomes None.
         return Message.model_construct(
             plant=reading.plant,
             node=reading.node,
@@ -209,7 +212,7 @@ class Translator:
             time=time,
             values=[None if value != value else value for value in reading.values.tolist()],
             inputs=None,
-            arrival=told_arrival,
+            arrival=stated_arrival,
         )
 
     def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
@@ -222,7 +225,8 @@ class Translator:
         if self.sources.steps and self.sources.step is None:
             return float(reading.time)
         time = date_of(reading.time)
-        if is_known and (arrival - time) // MICROSECOND * 1000 > YEAR:
+        is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # a clock that was never set
+        if is_unset:
             expected = f"a time that was set, near that of arrival, {arrival.isoformat()}"
             raise fail(f"{topic}, time", expected, time.isoformat())
         return time

@@ -96,13 +96,13 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
     # The metrics, with the labels of each.
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
-    what = "Values that count as not arrived, by reason; of flag and counter messages. A gate is of a filter."
-    refused = CounterMetricFamily("heliograph_refused", what, labels=["node", "filter", "reason"])
-    what = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
-    timeouts = CounterMetricFamily("heliograph_timeouts", what, labels=["node"])
-    what = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
-    held = CounterMetricFamily("heliograph_held", what, labels=["node"])
-    # Their values, by node; what a gate left out by filter.
+    of_refused = "Values that count as not arrived, by reason; of flag and counter messages. A gate is of a filter."
+    refused = CounterMetricFamily("heliograph_refused", of_refused, labels=["node", "filter", "reason"])
+    of_timeouts = "Silences longer than a node's timeout that have ended; heliograph_dead_senders has those that last."
+    timeouts = CounterMetricFamily("heliograph_timeouts", of_timeouts, labels=["node"])
+    of_held = "Runs of equal readings longer than noise allows, of a node that does not refuse them (stuck=)."
+    held = CounterMetricFamily("heliograph_held", of_held, labels=["node"])
+    # Their values, by node, where a count may be None; what a gate left out by filter.
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict] or 0)

@@ -46,7 +46,7 @@ class PlantTroubles(NamedTuple):
         lines = [f"{node}: its sender is dead" for node in self.dead]
         lines += [f"{d.node}/{d.filter}: squared innovations {d.ratio:.2g} times what its covariance says "
                   f"({d.low:.2g} to {d.high:.2g})" for d in self.doubts]  # fmt: skip
-        return lines + [self.refused] * bool(self.refused)
+        return [*lines, self.refused] if self.refused else lines
 
 
 class TroubleOverview:

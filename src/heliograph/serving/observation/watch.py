@@ -83,7 +83,8 @@ class Watch:
         """
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
-        # Held while a batch is taken, and while its outputs are recorded; when the batch began that is being taken.
+        # `lock` is held while a batch is taken, `_noting` while its outputs are recorded. Then: when the batch that is
+        # being taken began.
         self.lock, self._noting = threading.Lock(), threading.Lock()
         self._batch_started: float | None = None
         # Of all plants together: services, tests of claims, weighed outputs, counts, what is wrong, batches.
@@ -91,7 +92,8 @@ class Watch:
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentOutputs(MEMORY, names or {})
         self.totals, self._overview = CountTotals(), TroubleOverview()
-        self._service_answers = LastAnswers(self.lock, self._ask_services, ServiceAnswers([], {}, 0, 0), PLANTS)
+        no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
+        self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)
         self._batches = BatchHistograms()
         # Of each plant with a new message.
         self._memory = PlantMemory(names or {})
@@ -224,6 +226,7 @@ class Watch:
         """
         with self._noting:
             name = self._memory.newest_plant if plant is None else plant
+        # Asked without holding `_noting`, since it may take the other lock.
         answers = self._service_answers.ask(name)
         with self._noting:
             # One JSON object; lists are bounded, so that its size does not grow with the plants.

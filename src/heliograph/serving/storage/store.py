@@ -263,7 +263,7 @@ class Store:
             # Plants with their next version, the batch in the journal, and the counts.
             if plants:
                 next_versions = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
-                self._put(connection, PLANTS, [with_checksum(PLANTS, *row) for row in next_versions])
+                self._upsert(connection, PLANTS, [with_checksum(PLANTS, *row) for row in next_versions])
             if outputs:
                 lines = b"\n".join([output.body for output in outputs]).decode()
                 connection.execute(JOURNAL.insert(), [with_checksum(JOURNAL, newest, self.process, lines)])
@@ -271,7 +271,7 @@ class Store:
             if malformed:
                 self._add_to_count(connection, MALFORMED, malformed)
             if published is not None:
-                self._put(connection, NUMBERS, [with_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
+                self._upsert(connection, NUMBERS, [with_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
         return outputs
 
     def unpublished(self) -> list[Output]:
@@ -318,7 +318,7 @@ class Store:
         rows = [with_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
         if rows:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
-                self._put(connection, NUMBERS, rows)
+                self._upsert(connection, NUMBERS, rows)
 
     def _count_written(self, name: str, value: int, written: int) -> int:
         """Return a stored count; raise ValueError if `written` is not the checksum of it."""
@@ -343,7 +343,7 @@ class Store:
                 versions = {name: version for name, version, _, _ in rows}
                 bodies = carrier.migrate({name: body for name, _, body, _ in rows})
                 after = [with_checksum(PLANTS, name, versions[name] + 1, body) for name, body in bodies.items()]
-                self._put(connection, PLANTS, after)
+                self._upsert(connection, PLANTS, after)
             this = IDENTITY_TABLE.c.name == IDENTITY
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
         self.identity = mine
@@ -388,7 +388,7 @@ class Store:
             connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
         return int(value)
 
-    def _put(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
+    def _upsert(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
         """Insert rows, or replace those of the same name."""
         new = self._insert(table)
         others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
