@@ -61,7 +61,7 @@ def list_state_scores(
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
         parts = [_sum_errors(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
-        if parts:
+        if parts:  # of all chunks together, field by field
             sums = ErrorSums(*(np.sum(totals, axis=0) for totals in zip(*parts, strict=True)))
             results += _compute_state_scores(setting, labels, claims[setting], [0, *steps], sums)
     return results
@@ -246,21 +246,36 @@ def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None)
 
     Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
     """
-    scored = [
-        StateScore(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
-               s.nees_error, s.finite_runs)
-        for s in scores
-    ]  # fmt: skip
+    scored = [_score_all_states(score) for score in scores]
     if look is None:
         return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = look(settings[:1], steps)
+    # So many settings with as many rows as the first have some ROWS rows together.
     detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
     at_steps = [detail for detail in detailed if detail.step]
     return [_make_scores_table(campaign, scored), _make_steps_table(campaign, at_steps)]
+
+
+def _score_all_states(score: Score) -> StateScore:
+    """Return a score of all states together in the form of those of single states; it has no claimed deviation."""
+    return StateScore(
+        setting=score.setting,
+        node=score.node,
+        filter=score.filter,
+        claim=score.claim,
+        state=ALL,
+        step=0,
+        rmse=score.rmse,
+        rmse_error=score.rmse_error,
+        claimed=math.nan,
+        nees_per_dimension=score.nees_per_dimension,
+        nees_error=score.nees_error,
+        finite_runs=score.finite_runs,
+    )
 
 
 def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:

@@ -163,6 +163,7 @@ def _compute_settings(
     total = already + len(missing)
     progress("simulating", already, total)
     failed |= _try_jobs(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
+    # A setting that failed as a whole has no chunk.
     return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
 
 

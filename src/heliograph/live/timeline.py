@@ -343,7 +343,7 @@ class Timeline:
         other = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
         migration = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
         migration.begin("snapshot", other)
-        # The plant, which has no name, and the final rows, if their filters are the same.
+        # The plant, which has no name; and the final rows, whose columns are those of the filters.
         try:
             plant = np.frombuffer(migration.migrate({"": arrays["plant"].tobytes()})[""], np.uint8)
         except ValueError as error:

@@ -50,7 +50,7 @@ def draw_forecasts(
             last_deviation = np.sqrt(np.asarray(estimate.covariance)[-1, i, i])
             mean = np.append(last_mean, forecast.states.mean[:, i])
             band = sigmas * np.append(last_deviation, forecast.states.deviation[:, i])
-            panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))
+            panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))  # dashed
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
     for panel in panels if forecasts else ():
         panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)

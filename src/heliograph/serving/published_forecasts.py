@@ -53,7 +53,8 @@ class ForecastPublisher:
             self.horizons: list[float] = list(range(1, horizons + 1))
         else:
             self.horizons = [self._convert_horizon(horizon) for horizon in horizons]
-        if not self.horizons or min(self.horizons) <= 0 or sorted(set(self.horizons)) != self.horizons:
+        are_increasing = sorted(set(self.horizons)) == self.horizons
+        if not self.horizons or min(self.horizons) <= 0 or not are_increasing:
             raise fail("--forecast", "horizons ahead, each later than the one before", show_value(horizons))
 
     def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
@@ -105,7 +106,7 @@ class ForecastPublisher:
 
     def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:
         """Return the forecasts from the row with this number among those in `bodies`, by horizon; `now`: its time."""
-        unit = 1.0 if self._continuous else self._fleet.options.step or 1.0
+        unit = 1.0 if self._continuous else self._fleet.options.step or 1.0  # seconds of a step, where steps have dates
         results: list[Ahead] = []
         for i, distance in enumerate(self.horizons):
             by_filter: dict[str, dict[str, object]] = {
@@ -130,6 +131,7 @@ class ForecastPublisher:
             bodies: what is published of them, which is changed.
             number: number of the row among them.
         """
+        # Paths are drawn from this row alone.
         start = ForecastStart(make_row_origin(self._fleet, row.slot, float(row.key[0])))
         for node, filters in found.items():
             for name, forecast in filters.items():

@@ -69,7 +69,8 @@ class SilenceWatch:
             # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
             leap = plant.leap
             has_open_leap = leap is not None and leap.now > -inf and not leap.believed
-            if passed > plant.confirmed and (has_open_leap or passed > plant.rows.held[-1].key[0]):
+            has_new_step = passed > plant.rows.held[-1].key[0]
+            if passed > plant.confirmed and (has_open_leap or has_new_step):
                 due.append((plant, float(passed)))
         return due
 
@@ -85,7 +86,8 @@ class SilenceWatch:
         for plant, origin in self._iterate_dated_plants(plants):
             at = (now - origin) / timedelta(seconds=step or 1.0)
             at = at if step is None else min(floor(at), self.fleet.end_step)
-            if at > plant.now and set(self._dead_senders(plant, at)) - set(self._published_dead_senders(plant)):
+            newly_dead = set(self._dead_senders(plant, at)) - set(self._published_dead_senders(plant))
+            if at > plant.now and newly_dead:
                 found.append((plant, float(at)))
         return found
 
@@ -130,11 +132,13 @@ class SilenceWatch:
         step = self.fleet.options.step or 1.0
         if self.every is not None and (row.key[0] - published.time) * step >= self.every:
             return True
-        # Means and deviations (filter, state), now and before, in units of the deviations before.
-        before = np.sqrt(np.maximum(published.outputs[self._variances], 0.0))
-        now = np.sqrt(np.maximum(output[self._variances], 0.0))
-        moved = np.abs(output[self._means] - published.outputs[self._means]) > MOVED * before
-        return bool((moved | (np.abs(now - before) > MOVED * before)).any())
+        # Changes of means and deviations (filter, state), compared with the deviations before.
+        deviation_before = np.sqrt(np.maximum(published.outputs[self._variances], 0.0))
+        deviation_now = np.sqrt(np.maximum(output[self._variances], 0.0))
+        mean_change = np.abs(output[self._means] - published.outputs[self._means])
+        deviation_change = np.abs(deviation_now - deviation_before)
+        enough = MOVED * deviation_before
+        return bool(((mean_change > enough) | (deviation_change > enough)).any())
 
     def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
         """Return the dead senders of a plant, by now."""

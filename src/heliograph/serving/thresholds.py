@@ -85,12 +85,15 @@ def find_crossings(
         horizons: how far ahead, in steps or in the unit of dt.
         whole: whether horizons are steps; every step up to the last is then looked at, else the horizons alone.
     """
+    node, filter_name = place
     ahead = int(horizons[-1]) if whole else horizons
-    paths = heliograph.forecasting.draw_paths(source, ahead, "held", DRAWS, node=place[0], filter=place[1])
+    paths = heliograph.forecasting.draw_paths(source, ahead, "held", DRAWS, node=node, filter=filter_name)
+    # Row of each horizon in the paths, which have every step, or the horizons alone.
     rows = [int(horizon) - 1 for horizon in horizons] if whole else range(len(horizons))
     found = dict[str, list[dict[str, float]]]()
     for threshold in thresholds:
-        beyond = paths.is_beyond(*threshold)
+        beyond = paths.is_beyond(*threshold)  # (path, row)
+        # Share of the paths that are beyond at a row, and that were at any row up to it, with its standard error.
         then, by = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
         error = np.sqrt(by * (1 - by) / DRAWS)
         found[str(threshold)] = [

@@ -80,7 +80,7 @@ def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
 def _draw_estimates(learned: FitResults) -> Figure:
     """Draw a panel for each number, since units differ: start, estimates by both forms of the likelihood, intervals."""
     rows = learned.fit.rows()[:MOST]
-    # The form that counts is last: it is drawn first, on top.
+    # Of the two forms of the likelihood the one that counts is last. It is drawn at height 0, the other below at -1.
     forms = [solution.form for solution in reversed(learned.fit.solutions)]
     by_form = [learned.fit.rows(form=form) for form in forms]
     figure, grid = make_stacked_panels(len(rows), 0.62, 0.6, sharex=False)
@@ -88,7 +88,7 @@ def _draw_estimates(learned: FitResults) -> Figure:
         for height, estimates in enumerate(by_form):
             color, width = (BLUE, 3.0) if height == 0 else (MUTED, 1.5)
             _draw_estimate(axes, estimates[i], -height, color, width)
-        start = learned.starts[row.name]
+        start = learned.starts[row.name]  # a triangle above
         axes.plot(start, 0.6, "v", color=AMBER, markersize=5, clip_on=False)
         # A positive number that is known to a factor of ten or worse is shown by its logarithm.
         shown = [row.low, row.high, row.estimate, start]

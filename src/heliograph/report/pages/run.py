@@ -249,7 +249,7 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
     """
     pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):
-        nodes = _nodes_to_draw(record)
+        nodes = _nodes_to_draw(record)  # the first few: estimates of others are in the record alone
         added = ", given later data too" if kind == "smoothed" else ""
         if (name := _map_name(kind)) in drawings:
             text = f"The path that {visible(nodes[0])} estimates{added}"
@@ -264,8 +264,8 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
                 title = f"Modes at {visible(node)} over time{added}"
                 modes[node] = Picture(drawings[name], title, f"{visible(node)}: probability of each mode{added}.")
         pictures += [*choose_picture(estimates), *choose_picture(modes)]
-        absent = [node for node in nodes if node not in estimates]
-        pictures += say_not_drawn(absent, f"Their figures are files beside this page ({kind}_0.svg and on).")
+        too_large = [node for node in nodes if node not in estimates]  # to stand in the page, but drawn
+        pictures += say_not_drawn(too_large, f"Their figures are files beside this page ({kind}_0.svg and on).")
         pictures += say_not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
     return pictures
 

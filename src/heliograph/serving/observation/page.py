@@ -30,6 +30,7 @@ from heliograph.serving.observation.watch import LISTED, Watch
 
 STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"
+LEAST_TOKEN = 16  # characters of a token
 HEALTH = "/healthz"
 EVERY = 0.5  # seconds between looks
 NAME = re.compile(r"[A-Za-z0-9._-]+|\[[0-9a-fA-F:.]+\]")
@@ -82,8 +83,9 @@ def parse_page_address(
     token = (os.environ if environment is None else environment).get(TOKEN, "")
     if _is_loopback(host) and not token:
         return PageAddress(host, int(port), None, tuple(hosts))
-    if len(token) < 16:
-        raise fail(f"page at {host}", f"a token of 16 characters at least in {TOKEN}", f"one of {len(token)}")
+    if len(token) < LEAST_TOKEN:
+        expected = f"a token of {LEAST_TOKEN} characters at least in {TOKEN}"
+        raise fail(f"page at {host}", expected, f"one of {len(token)}")
     return PageAddress(host, int(port), token, tuple(hosts))
 
 

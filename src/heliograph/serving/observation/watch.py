@@ -267,10 +267,10 @@ class Watch:
         """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
         every = list(self.plants())
         return ServiceAnswers(
-            sorted(name for name, _ in every),
-            _add_counts([status for name, status in every if name == plant]),
-            sum(service.malformed for service in self.services),
-            len(self.list_worst_plants()),
+            names=sorted(name for name, _ in every),
+            links=_add_counts([status for name, status in every if name == plant]),
+            malformed=sum(service.malformed for service in self.services),
+            wrong=len(self.list_worst_plants()),
         )
 
     def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
@@ -281,7 +281,8 @@ class Watch:
         rows: list[dict[str, object]] = []
         for name, (claim, parts) in self.fused.items():
             tested = [(source, tests[source]) for source in parts if source in tests]
-            if not tested or (Network.FUSED, name) in tests:
+            has_own_test = (Network.FUSED, name) in tests
+            if not tested or has_own_test:
                 continue
             doubted = ["/".join(source) for source, test in tested if test.explain_doubt()]
             numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in tested)}
@@ -347,4 +348,4 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> W
     all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
     names |= {(Network.FUSED, name): all_names for name in network.fused}
     unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
-    return Watch(network.states, title, unit, fused, names, uncounted)
+    return Watch(network.states, title, time_unit=unit, fused=fused, names=names, uncounted=uncounted)

@@ -66,7 +66,8 @@ def own_store(location: str, process: str) -> Iterator[None]:
 @contextmanager
 def _lock_file(path: str, process: str) -> Iterator[None]:
     """Hold a lock on a file beside an SQLite store, which names the process that has it."""
-    lock = f"{path}{'.' if process else ''}{''.join(c if c.isalnum() else '-' for c in process)}.lock"
+    safe_name = "".join(c if c.isalnum() else "-" for c in process)  # a process's name may be no name of a file
+    lock = f"{path}{'.' if process else ''}{safe_name}.lock"
     try:
         file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError:  # the store itself says that nothing can be written there
@@ -88,7 +89,7 @@ def _lock_file(path: str, process: str) -> Iterator[None]:
 @contextmanager
 def _lock_session(engine: Engine, process: str) -> Iterator[None]:
     """Hold an advisory lock of PostgreSQL for the life of a session, whose application's name is the process's."""
-    key = crc32(process.encode()) >> 1
+    key = crc32(process.encode()) >> 1  # 31 bits: the server takes signed numbers of 32
     with engine.connect() as connection:
         connection.execute(text("SELECT set_config('application_name', :name, false)"),
                            {"name": f"heliograph {name_of_process()}"[:63]})  # fmt: skip
