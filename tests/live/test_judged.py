@@ -96,7 +96,7 @@ def test_an_implausible_value_in_a_fused_filter_is_its_nodes_and_costs_that_valu
         clean.push(name, 0, 0, [0.1 * i])
     clean.push("a", 1, 1, [0.3])
     plant = service.plants[""]
-    outputs = service.fleet.outputs_after([plant.rows.held[-1].slot])[0]
+    outputs = service.fleet.outputs([plant.rows.held[-1].slot])[0]
     expected = clean.estimates()["fused"]["all"]
     place = service.fleet.program.filter_columns[-1]
     assert outputs[place.mean] == pytest.approx(expected.mean[0], rel=1e-12)

@@ -240,11 +240,11 @@ class DecidingSender(NamedTuple):
 
 def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
     """Return the sender of which a filter knows what its silence means; None of any other filter."""
-    world = filter.premise
-    if not filter.silence_tells or world is None or world.trigger is None:
+    premise = filter.premise  # the plant, sensor, channel and trigger that the filter was made for
+    if not filter.silence_tells or premise is None or premise.trigger is None:
         return None
-    assert world.sensor is not None and world.channel is not None  # a sender has both
-    return DecidingSender(world.trigger, world.channel, len(first(world.sensor).outputs))
+    assert premise.sensor is not None and premise.channel is not None  # a sender has both
+    return DecidingSender(premise.trigger, premise.channel, outputs=len(first(premise.sensor).outputs))
 
 
 class CompiledFilter:

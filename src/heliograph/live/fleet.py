@@ -299,7 +299,7 @@ class Fleet:
         `touched`: the plants that have taken events, or whose time went on.
         """
         plants, results = list(touched), []
-        self.step_changed_rows(plants)
+        self.step(plants)
         for plant in plants:
             withdrawn, their_slots = plant.take_withdrawn()
             watermark = np.inf if all_ else plant.confirmed - self.options.window
@@ -308,7 +308,7 @@ class Fleet:
             results.append(FinalisedPlant(plant, final, newest, left=left + their_slots, withdrawn=withdrawn))
         return results
 
-    def step_changed_rows(self, plants: Iterable[PlantState]) -> None:
+    def step(self, plants: Iterable[PlantState]) -> None:
         """Step the rows that have changed, and all after them, for all plants at once; write them into the table."""
         chains = [chain for plant in plants if (chain := plant.take_dirty_rows())]
         if rows := [row for chain in chains for row in chain]:
@@ -349,7 +349,7 @@ class Fleet:
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
         return self.pool.predict_outputs(np.array(slots), given, self.end_step)
 
-    def outputs_after(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
+    def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
         """Return the outputs of all filters (row, output) after the rows in these slots of the table."""
         return self.pool.table[np.array(slots, dtype=int), self.pool.outputs]
 
@@ -395,4 +395,5 @@ def _check_options(options: Options) -> Options:
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))
-    return Options(window, ahead, float(leap), check_count("capacity", options.capacity), step)
+    capacity = check_count("capacity", options.capacity)
+    return Options(window=window, ahead=ahead, leap=float(leap), capacity=capacity, step=step)

@@ -63,7 +63,8 @@ class SlotTable:
         """Fill a slot with the prior, at `time`, before any measurement."""
         row = self.table[slot]
         row[:] = 0.0
-        row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, -1.0, np.nan
+        step_before_all = -1.0
+        row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, step_before_all, np.nan
         row[-1] = time
 
     def predict_outputs(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:

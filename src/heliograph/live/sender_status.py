@@ -99,8 +99,8 @@ class SilenceRule(NamedTuple):
     def of_node(node: Node) -> "SilenceRule | None":
         """Return the sender of a node; None of one that may be silent for any time."""
         if node.trigger is None:
-            return None if node.timeout is None else SilenceRule(None, None, node.timeout)
-        return SilenceRule(node.trigger, LossChain.of_channel(node.channel), node.timeout)
+            return None if node.timeout is None else SilenceRule(trigger=None, losses=None, timeout=node.timeout)
+        return SilenceRule(node.trigger, losses=LossChain.of_channel(node.channel), timeout=node.timeout)
 
     def find_status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
         """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.

@@ -188,7 +188,7 @@ class Timeline:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
                 self._fleet.undo_events(plant, clock_before)
-                self._fleet.step_changed_rows([plant])
+                self._fleet.step([plant])
             else:
                 for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
                     warnings.warn(f"timeline, {line}", stacklevel=2)
@@ -204,7 +204,7 @@ class Timeline:
         Inputs are also judged over one unit of time after them.
         """
         fleet, plant = self._fleet, self._plant
-        fleet.step_changed_rows([plant])
+        fleet.step([plant])
         why = self._judges.find_implausible([Candidate(0, plant, event, row)]).get(0)
         if why is None and event.is_inputs and self._program.dt is not None:
             after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)

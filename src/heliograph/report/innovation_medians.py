@@ -39,7 +39,7 @@ def find_law_medians(
     # M (v - E v) of drawn noises, (draws, received), with the mean gain M.
     with jax.enable_x64(True):
         noises = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), DRAWS)))
-        # The mean of the channel's affine map, of which the last column is its offset.
+        # Of the mean of the channel's map the block from inputs to outputs; the rest belongs to the constant 1.
         gain = np.asarray(channel.moments(1).matrix)[: channel.outputs, : channel.inputs]
     received = (noises - np.asarray(noise.mean)) @ gain.T
     # A Gaussian number beside it, of what is left of the claimed variance.

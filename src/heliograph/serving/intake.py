@@ -110,7 +110,7 @@ class BatchIntake:
 
     def _refuse_implausible(self) -> set[str]:
         """Step what was taken, note what is implausible in `_refused`, and restore its plants; return their names."""
-        self.fleet.step_changed_rows({taken.plant.name: taken.plant for taken in self._taken}.values())
+        self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
         restored = set[str]()
         for i, why in self._judges.find_implausible(self._taken).items():
             taken = self._taken[i]

@@ -392,7 +392,7 @@ class Service:
         """Return the estimates after these rows as lines of JSON, one each; `kind` is "final" or "provisional"."""
         moments = [(plant.name, row.key[0] if plant.origin is None else self._time_in_messages(plant, row.key[0]))
                    for plant, row in rows]  # fmt: skip
-        return self._writer.write_lines(kind, moments, self.fleet.outputs_after([row.slot for _, row in rows]))
+        return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
     def _time_in_messages(self, plant: PlantState, at: float) -> float | str:
         """Return the time of a row as messages have it."""

@@ -110,7 +110,7 @@ class SilenceWatch:
     def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
         """Note that the estimates after these rows were published."""
         if self.fleet.watched:
-            outputs = self.fleet.outputs_after([row.slot for _, row in rows])
+            outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
                 self._published[plant.name] = PublishedEstimate(output, self._dead_senders(plant), row.key[0])
                 self._resumed.discard(plant.name)
@@ -121,7 +121,7 @@ class SilenceWatch:
 
     def select_for_publication(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
         """Return the rows whose estimates differ from what was published, or which are due again."""
-        outputs = self.fleet.outputs_after([row.slot for _, row in rows])
+        outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_news(*pair, output)]
 
     def _is_news(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:

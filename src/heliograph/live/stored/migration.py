@@ -181,7 +181,7 @@ class PlantMigration:
         # All rows after the base are stepped with what the network is now.
         for plant in plants.values():
             plant.dirty = 1 if len(plant.rows.held) > 1 else None
-        self.fleet.step_changed_rows(plants.values())
+        self.fleet.step(plants.values())
         results = {name: pack_plant(plant, self.fleet) for name, plant in plants.items()}
         for plant in plants.values():
             self.fleet.end_plant(plant)

@@ -121,9 +121,9 @@ class Watch:
     def note(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
         """Record the outputs and statistics of a batch, `last`; None where nothing came."""
         with self._noting:
-            self._record(outputs, last)
+            self._record_batch(outputs, last)
 
-    def _record(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
+    def _record_batch(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
         """Update times, counts, points and tests by a batch's outputs; call it with `_noting` held."""
         if last is not None:
             self._batches.observe(last)

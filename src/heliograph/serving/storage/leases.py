@@ -51,7 +51,7 @@ class Leases:
         """
         with self._raise_if_away(), self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
-            fair = self._fair_share(connection, now)
+            fair = self._report_and_count_fair_share(connection, now)
             leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
             held = [(row.number, row.process) for row in connection.execute(leased)]
             own = [number for number, process in sorted(held) if process == self.process]
@@ -81,8 +81,11 @@ class Leases:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 
-    def _fair_share(self, connection: Connection, now: float) -> int:
-        """Return how many parts this process should have; the remainder goes to the first processes by name."""
+    def _report_and_count_fair_share(self, connection: Connection, now: float) -> int:
+        """Report that this process is alive, forget the dead, and return how many parts this one should have.
+
+        The remainder goes to the first processes by name.
+        """
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))

@@ -304,14 +304,14 @@ class Store:
         """Return the stored count of this name; 0 where none was stored."""
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
-        return 0 if row is None else self._count_written(*row)
+        return 0 if row is None else self._check_count(*row)
 
     def words(self) -> dict[str, int]:
         """Return the last words of devices that are kept, as numbers by topic."""
         mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = connection.execute(mine).all()
-        return {name.removeprefix(WORD): self._count_written(name, value, written) for name, value, written in rows}
+        return {name.removeprefix(WORD): self._check_count(name, value, written) for name, value, written in rows}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
         """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
@@ -320,7 +320,7 @@ class Store:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
                 self._upsert(connection, NUMBERS, rows)
 
-    def _count_written(self, name: str, value: int, written: int) -> int:
+    def _check_count(self, name: str, value: int, written: int) -> int:
         """Return a stored count; raise ValueError if `written` is not the checksum of it."""
         if not is_whole(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
@@ -383,7 +383,7 @@ class Store:
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
         # A count that was there has the checksum of what it was before.
         if written != checksum(name, value):
-            value = self._count_written(name, value - more, written) + more
+            value = self._check_count(name, value - more, written) + more
             this = NUMBERS.c.name == name
             connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
         return int(value)
