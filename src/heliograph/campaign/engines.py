@@ -221,7 +221,7 @@ def _submit_jobs(
 
     running: dict[object, Job] = {}  # by future
     collect: Untyped = as_completed
-    futures = collect(loop=client.loop)  # yields those that are done
+    futures = collect(loop=client.loop)  # all that are added below; it yields those that are done
     while waiting or running:
         # Submit a few jobs more than the cluster has threads, so that none of them waits.
         threads = sum(_ask_cluster(client.nthreads).values())

@@ -260,9 +260,9 @@ class Fleet:
         clock_time = event.arrival if arrival_known else event.time
         clock_name = ARRIVAL if arrival_known else clock or self._names[event.node_index]
         # A second clock may agree: the one on the wall, or the sender's with that of arrivals.
-        agreed = (wall is not None and abs(clock_time - wall) <= longest_gap) or (
-            arrival_known and abs(clock_time - event.time) <= longest_gap
-        )
+        wall_agrees = wall is not None and abs(clock_time - wall) <= longest_gap
+        sender_agrees = arrival_known and abs(clock_time - event.time) <= longest_gap
+        agreed = wall_agrees or sender_agrees
         # An event from the future will be refused, and takes back no leap.
         if plant.leap is not None and event.time <= event.arrival + self.options.ahead:
             plant.undo_contradicted_leap(clock_name, clock_time, longest_gap, agreed, self._names)

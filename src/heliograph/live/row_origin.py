@@ -10,7 +10,7 @@ from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 
 
-def make_row_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
+def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
     """Return where forecasts from the row in a slot start, or from those in several; the pool stays as it is.
 
     Args:
@@ -58,7 +58,7 @@ def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> di
     estimates = estimates_by_name(program, outputs)
     for columns in program.filter_columns:
         tested = columns.judgement or columns.tested  # columns of its squared distance and count
-        if tested is None:
+        if tested is None:  # it judges nothing: its estimate stands as it is
             continue
         estimate, nis = estimates[columns.node][columns.filter], float(outputs[tested.distance])
         reason = 0.0 if columns.judgement is None else float(outputs[columns.judgement.reason])

@@ -14,7 +14,7 @@ from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
 from heliograph.live.implausible_events import Candidate, FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_program import shared_program
-from heliograph.live.row_origin import estimates_by_name, judged_estimates_by_name, make_row_origin
+from heliograph.live.row_origin import estimates_by_name, judged_estimates_by_name, make_forecast_origin
 from heliograph.live.sender_status import SenderStatus
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
@@ -226,7 +226,7 @@ class Timeline:
     @property
     def origin(self) -> Origin:
         """Return the filters' states at `now`, from which `hg.forecast` predicts; late events are taken as before."""
-        return make_row_origin(self._fleet, *self._slot_now())
+        return make_forecast_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
         """Return the slot of the row at `now`, which is predicted where there is none, and its time."""

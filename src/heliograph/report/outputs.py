@@ -47,7 +47,7 @@ def compare_with_truth(record: Record) -> list[FilterErrors]:
     """Return the errors of each filter, the fused ones first; nothing of a record without true states."""
     if record.truth is None:
         return []
-    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)  # states whose truth is known, by row
+    known = np.sum(~np.isnan(np.asarray(record.truth)), axis=-1)  # how many states' truth is known, by row
     results = []
     for node, estimates in sorted(record.estimates.items(), key=lambda pair: pair[0] != Network.FUSED):
         for name, estimate in estimates.items():

@@ -211,7 +211,7 @@ async def _watching(settings: ServiceSettings) -> AsyncIterator[WrapService]:
 async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService) -> None:
     """Serve all plants in this process, until the messages end or a signal; `wrap` shows the service on the page."""
     stop = asyncio.Event()
-    # The reader of messages that others make; where it has sources, they say how long a step is.
+    # The reader of messages in others' form, where the network's file has sources; these then say how long a step is.
     reader = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reader is None else reader.sources.step
     fleet = Fleet(program, settings.options._replace(step=step))
@@ -224,6 +224,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
         try:
             service.resume()
             transport = _open_transport(settings, reader)
+            # Of devices that say when they go offline the last such word is kept in the store too.
             shown = wrap(service) if reader is None else LastWordsService(wrap(service), reader.sources.words, store)
             await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:

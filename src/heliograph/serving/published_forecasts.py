@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph
 from heliograph.live.fleet import Fleet
-from heliograph.live.row_origin import make_row_origin
+from heliograph.live.row_origin import make_forecast_origin
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, show_value
@@ -90,7 +90,7 @@ class ForecastPublisher:
             return results
         # Forecasts by node and filter, each of all covered rows; then what is published of them.
         slots = [rows[i].slot for i in covered]
-        start = ForecastStart(make_row_origin(self._fleet, slots, np.array([times[i] for i in covered])))
+        start = ForecastStart(make_forecast_origin(self._fleet, slots, np.array([times[i] for i in covered])))
         forecasts = heliograph.forecast(start, self.horizons, inputs="held")
         assert isinstance(forecasts, dict)  # of a network
         bodies = {
@@ -132,7 +132,7 @@ class ForecastPublisher:
             number: number of the row among them.
         """
         # Paths are drawn from this row alone.
-        start = ForecastStart(make_row_origin(self._fleet, row.slot, float(row.key[0])))
+        start = ForecastStart(make_forecast_origin(self._fleet, row.slot, float(row.key[0])))
         for node, filters in found.items():
             for name, forecast in filters.items():
                 of_row = bodies[node][name][number]

@@ -85,8 +85,8 @@ class Store:
             raise
         except InputError as error:
             self.close()
-            fits = carrier is None and self.identity.get(LAYOUT_KEY) in CARRIED
-            more = "; --accept-changes goes on with what fits" if fits else ""
+            can_be_carried = carrier is None and self.identity.get(LAYOUT_KEY) in CARRIED
+            more = "; --accept-changes goes on with what fits" if can_be_carried else ""
             raise InputError(f"{error}; to begin anew, name another{more}") from None
 
     def _open_state(self, mine: Identity | None, opened: "Store | None", carrier: PlantMigration | None) -> None:
