@@ -70,7 +70,7 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
     gap = "–" if link.due is None else str(link.longest_gap)
-    past = []  # a column that is there if any sender was silent past its timeout
+    past: list[str] = []  # a column that is there if any sender was silent past its timeout
     if health.silences:
         quiet = health.silences.get(link.node)
         past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"]
