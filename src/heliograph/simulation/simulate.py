@@ -109,7 +109,7 @@ def monte_carlo(
         network = network.with_nominal_claims()
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, horizon)
     # Native code, where it supports network and reducer.
-    if has_processor_alone() and not any(mesh.is_long for mesh in build_meshes(network).values()):
+    if has_processor_alone() and not _has_long_step(network):
         with explain_out_of_memory(runs, horizon):
             by_native_code = simulate_natively(
                 network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision
@@ -133,6 +133,11 @@ def monte_carlo(
     with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
     return _warn_of_invalid_numbers(finish_result(reducer, recorded, network, smoothing), network)
+
+
+def _has_long_step(network: "Network") -> bool:
+    """Return whether a fusion between neighbours has too many operations a step to be written out as native code."""
+    return any(mesh.is_long for mesh in build_meshes(network).values())
 
 
 def _warn_of_invalid_numbers(result: Result, network: Network) -> Result:

@@ -23,10 +23,13 @@ def build_mesh(network: Network, name: str) -> Mesh:
     assert fusion.neighbours is not None
     nodes = network.mesh_nodes(name)
     graph = graph_of(fusion.neighbours, nodes)
-    # Rows of the graph, those of about as many neighbours together; a row's first sender is the node itself.
+    # Nodes of about as many neighbours are computed together, as one bucket. A node is the first of its own senders.
     buckets = []
-    for rows in graph.buckets():
-        buckets.append(NodeBucket(fusion.rule.placed(rows), rows=rows.senders[:, 0], width=rows.senders.shape[1]))
+    for part in graph.buckets():
+        members, width = part.senders[:, 0], part.senders.shape[1]
+        buckets.append(NodeBucket(rule=fusion.rule.placed(part), rows=members, width=width))
+    # Place of each node among the results of all buckets, one after another: the inverse of the order of the members.
+    ranks = np.argsort(np.concatenate([bucket.rows for bucket in buckets]))
     # Kinds of the mesh's estimates, one for each group of nodes, and the places of their nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
     kinds = [kind for kind in network.mesh_kinds if kind.filters == (name,)]
@@ -34,7 +37,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
     return Mesh(
         plant=network.plant,
         buckets=tuple(buckets),
-        ranks=np.argsort(np.concatenate([bucket.rows for bucket in buckets])),
+        ranks=ranks,
         edges=build_edges(fusion, graph),
         observation_model=_model_measurements(network, nodes),
         senders=graph.senders,
@@ -43,7 +46,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
         alpha=None if fusion.alpha is None else np.asarray(fusion.alpha),  # an argument of the program, no constant
         quantizer=stack(fusion.quantizers(graph.nodes)) if fusion.quantizer is not None else None,
         needs_joint=fusion.rule.needs_joint,
-        claim=network.claims()[nodes[0]][name],
+        claim=network.claims()[nodes[0]][name],  # the same at every node
     )
 
 

@@ -15,23 +15,37 @@ LEVEL = 0.01  # of each test
 LAGS = 10  # messages over which correlations are tested, at most
 
 
+class NisOfClass(NamedTuple):
+    """Mean square of the innovations of one class, and the interval in which it is if their claim is true.
+
+    Args:
+        mean: of the squares, 1 where the claim is true.
+        low: lower end of the interval.
+        high: upper end.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
 class InnovationTests(NamedTuple):
     """Tests of innovations over their claimed deviation: sizes by class, and correlation over time.
 
     Args:
-        nis: mean square of each class, with the lower and upper end of its interval for a true claim.
+        nis: mean square of each class, with its interval for a true claim.
         correlation: over one message.
         p_value: of the correlations over up to ten messages, if there were none in truth.
     """
 
-    nis: list[tuple[float, float, float]]
+    nis: list[NisOfClass]
     correlation: float
     p_value: float
 
     @property
     def contradicts(self) -> bool:
         """True if sizes or correlations contradict the declared variances, at 1 % each."""
-        return self.p_value < LEVEL or any(not low <= nis <= high for nis, low, high in self.nis)
+        return self.p_value < LEVEL or any(not nis.low <= nis.mean <= nis.high for nis in self.nis)
 
 
 def examine_innovations(
@@ -44,22 +58,24 @@ def examine_innovations(
         filter: the filter, as declared or refitted.
         classes: class of each row, -1 of a row that is not used.
     """
-    # Innovations u over their claimed deviation, of the values of this link.
+    # Innovations of this link's values over their claimed deviation: independent with variance 1 if the claim is true.
     white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
-    # Two tails of each class, so that all classes together contradict a true claim with probability LEVEL.
-    tail, nis = LEVEL / declared.classes / 2, list[tuple[float, float, float]]()
+    # Probability of each end of a class's interval, so that all classes together contradict a true claim in LEVEL.
+    tail = LEVEL / declared.classes / 2
+    nis = list[NisOfClass]()
     for number in range(declared.classes):
         squares = white[classes == number] ** 2
         count = int(np.sum(~np.isnan(squares)))
         mean = float(np.nansum(squares) / count)
         if filter.knows_gain:  # count times the mean is chi-squared of `count` degrees of freedom
             quantiles = (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail))
-            low, high = quantiles if count else (0, 1)
+            low, high = quantiles if count else (0, 1)  # without values anything will do: the mean is NaN
         else:  # Gaussian, with an error that counts correlations between rows
             _, error = average_correlated(np.nanmean(squares, axis=1))
             low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
-        nis.append((mean, float(low), float(high)))
-    return InnovationTests(nis, *_correlate(white[classes >= 0], filter.knows_gain))
+        nis.append(NisOfClass(mean, float(low), float(high)))
+    correlation, p_value = _correlate(white[classes >= 0], filter.knows_gain)
+    return InnovationTests(nis, correlation, p_value)
 
 
 def _correlate(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:

@@ -213,12 +213,12 @@ def _judge_link(
     heard = int(np.sum(classes >= 0))
     if heard < FEWEST:
         return None, heard
-    # As declared: where nothing is wrong, all scales are 1.
+    # With the variances as declared: where the innovations fit them, all scales are 1.
     before = examine_innovations(declared, filter, classes)
     if not before.contradicts:
         ones = np.ones(declared.classes)
         return _make_judgement(declared, classes, (before, before), (ones, ones, ones), None), heard
-    # With scales that fit best; and with a bias beside them where that does not explain the correlation over time.
+    # With the scales that fit best. Where innovations are still correlated over time, a bias is tried beside them.
     refit = refit_scales(declared)
     after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
@@ -254,10 +254,12 @@ def _compute_declared_variances(
 def _classify_rows(
     filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
-    """Divide a link's rows into classes of similar declared variances.
+    """Divide a link's rows into classes of similar declared variances; arguments as of `_judge_link`.
 
-    Returns the recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
-    Arguments as of `_judge_link`.
+    A row's size is the mean logarithm of the variances that its message declares.
+
+    Returns:
+        The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
     """
     z, place = z.copy(), find_place(filter, link)
     with np.errstate(all="ignore"):
@@ -271,8 +273,8 @@ def _classify_rows(
     # Rows in which the link declared something and a value came.
     heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
-    count = int(np.sum(~np.isnan(z[heard][:, place.values])))
-    classes = min(CLASSES, len(np.unique(log_size[heard])), max(count // EACH, 1))
+    numbers = int(np.sum(~np.isnan(z[heard][:, place.values])))
+    classes = min(CLASSES, len(np.unique(log_size[heard])), max(numbers // EACH, 1))
     inner = np.quantile(log_size[heard], np.arange(1, classes) / classes, method="lower") if heard.any() else []
     edges = np.array([edge for edge in np.unique(inner) if edge < log_size[heard].max()])
     # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
@@ -296,17 +298,17 @@ def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
         return None
     # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
     count = declared.classes
-    memory = count + 1
     rate, time = np.exp(best.logs[count:])
-    low, high = (float(np.exp(find_interval_end(declared, best, memory, sign))) for sign in (-1, 1))
+    at_memory = count + 1
+    time_low, time_high = (float(np.exp(find_interval_end(declared, best, at_memory, sign))) for sign in (-1, 1))
     # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
     largest = np.max(best.logs[:count])
     largest_end = max(find_interval_end(declared, best, number, 1) for number in range(count))
     return DeclaredBias(
         deviation=rate * np.sqrt(time) * declared.deviation,
         time=float(time),
-        time_low=low,
-        time_high=high,
+        time_low=time_low,
+        time_high=time_high,
         times_white=float(np.exp(-largest / 2)),
         times_white_low=float(np.exp(-largest_end / 2)),
         gain=gain,
@@ -320,7 +322,7 @@ def _make_judgement(
     scales: tuple[np.ndarray, np.ndarray, np.ndarray],
     bias: DeclaredBias | None,
 ) -> DeclaredJudgement:
-    """Return the judgement of what was found, class by class.
+    """Return the judgement of what was found; messages of similar declared variances are one class.
 
     Args:
         declared: the filter and the recording.
@@ -330,20 +332,20 @@ def _make_judgement(
         bias: what explains the innovations where no scale does; None without.
     """
     before, after = tested
-    place, results = declared.place, []
-    for number, (nis, low, high) in enumerate(before.nis):
-        # Declared variances of the class's messages: geometric means over the outputs.
+    place, judged_classes = declared.place, []
+    for number, (nis, nis_low, nis_high) in enumerate(before.nis):
+        # What each message of the class declares: one variance, the geometric mean over the outputs.
         rows = declared.z[classes == number]
         variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
         scale, scale_low, scale_high = (float(values[number]) for values in scales)
-        results.append(
+        judged_classes.append(
             DeclaredClass(
                 low=float(variances.min()),
                 high=float(variances.max()),
                 numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
                 nis=nis,
-                nis_low=low,
-                nis_high=high,
+                nis_low=nis_low,
+                nis_high=nis_high,
                 scale=scale,
                 scale_low=scale_low,
                 scale_high=scale_high,
@@ -351,8 +353,8 @@ def _make_judgement(
         )
     names = first(declared.filter.sensor).outputs
     return DeclaredJudgement(
-        outputs=tuple(names[i] for i in place.outputs or ()),
-        classes=tuple(results),
+        outputs=tuple(names[i] for i in place.outputs or ()),  # none where values are not outputs one by one
+        classes=tuple(judged_classes),
         correlation=before.correlation,
         p_value=before.p_value,
         refit_correlation=after.correlation,

@@ -261,7 +261,7 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
         constrained = _maximise_likelihood(declared, start, fixed=number)
         return best.likelihood - constrained.likelihood - REACH
 
-    # Doubled until the end is passed, then halved.
+    # The distance is doubled until the end is passed; then the span that holds the end is halved.
     near, far = 0.0, 0.25
     while compute_excess_fall(far) < 0:
         near, far = far, 2 * far
@@ -286,10 +286,12 @@ def _maximise_likelihood(
     # Limits of the logarithms: FARTHEST either way; of a bias's memory FAST steps and SLOW recordings.
     free = np.arange(len(start)) != fixed
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
-    if len(start) > declared.classes:
-        step = usual_step(declared)
-        low[-1], high[-1] = np.log(FAST * step), np.log(SLOW * len(declared.z) * step)
-    likelihood, steps = RefitLikelihood(declared), DIFFERENCE * np.eye(len(start))[free]
+    has_bias = len(start) > declared.classes
+    if has_bias:
+        time_step = usual_step(declared)
+        low[-1], high[-1] = np.log(FAST * time_step), np.log(SLOW * len(declared.z) * time_step)
+    likelihood = RefitLikelihood(declared)
+    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
 
     def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
         """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
@@ -298,13 +300,13 @@ def _maximise_likelihood(
         """
         all_logs = start.copy()
         all_logs[free] = logs
-        points = np.stack([all_logs, *(all_logs + steps), *(all_logs - steps)])
+        points = np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)])
         points = np.clip(points, low, high)  # flat beyond the limits
         values = -np.nan_to_num(over_runs(likelihood, points), nan=-LOST)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
 
-    if not free.any():
+    if not free.any():  # the only number is fixed: there is nothing to search
         loss, _ = compute_loss(start[free])
         return Refit(start, -loss)
     found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})

@@ -44,7 +44,7 @@ def compile_runs(
     later: NetworkSmoother | None = None,
     precision: Precision = "float64",
 ) -> NativeProgram:
-    """Compile the native code of a network's runs, of which a reducer collects the results of its `of_step`.
+    """Return the native code of a network's runs, each of them reduced step by step as the reducer says.
 
     Args:
         world: the network to be simulated, as a step.
@@ -52,13 +52,14 @@ def compile_runs(
         key: of all runs.
         reducer: says what is collected of each run.
         runs: how many will follow.
-        later: smooths each run; then results are pairs, of filtered and of smoothed estimates, and sums of the NIS.
+        later: smooths each run; then its results are those of `reduce_run`: of filtered estimates, of smoothed ones,
+            and sums of the NIS. None: nothing is smoothed.
         precision: in which runs are computed.
 
     Raises:
         Unsupported: a program that native code does not support.
     """
-    words = _read_key(key)
+    key_words = _read_key(key)
     # One program for networks of one structure: arrays are its arguments.
     (of_world, arrays), (of_rest, others) = _describe_world(world), _describe((later, inputs, reducer))
     try:
@@ -68,9 +69,10 @@ def compile_runs(
             raise
         raise Unsupported("a network with an object that cannot be compared with another") from None
     if isinstance(compiled, Unsupported):
+        # The refusal is cached; it is raised afresh, so that the cached one holds no traceback.
         raise Unsupported(compiled.operation, compiled.where)
-    program, form = compiled
-    return NativeProgram(program.begin([words, *arrays, *others], runs), form)
+    program, result_tree = compiled
+    return NativeProgram(program.begin([key_words, *arrays, *others], runs), result_tree)
 
 
 def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: int, precision: Precision) -> None:
@@ -214,7 +216,7 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
         of_rest: structure of (smoother that follows or None, inputs, reducer).
         precision: in which runs are computed.
     """
-    form: list[Any] = []  # filled when `run` is traced
+    result_trees: list[Any] = []  # one, which is found when `run` is traced
 
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
         """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
@@ -228,15 +230,16 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
             reduced = _simulate_smoothed_run(world, later, u, reducer, run_key)
         # Sums over runs by batch; flags too, which hold for a batch if the sum is above zero.
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
-        form[:] = [jax.tree.structure(OfStep(summed[0], summed[1], reduced.collected))]
+        sums, ever = summed
+        result_trees[:] = [jax.tree.structure(OfStep(sums, ever, reduced.collected))]
         return summed, reduced.collected
 
-    # Traced with a key, argument 0, and examples of the arrays; some of their entries are known.
+    # Traced with a key, argument 0, and examples of the arrays, of which some entries are known.
     key, known = jax.eval_shape(lambda: jax.random.key(0)), of_world.known + of_rest.known
     masks = {i: entries.mask for i, entries in enumerate(known, start=1) if entries.mask.any()}
     single = precision == "float32"
     program = accumulate(run, key, *(entries.example for entries in known), batches=BATCHES, known=masks, single=single)
-    return program, form[0]
+    return program, result_trees[0]
 
 
 @eqx.filter_jit
@@ -305,9 +308,9 @@ def simulate_natively(
     Returns:
         None where native code does not support the network or the reducer.
     """
-    # Smoothing, few nodes, nodes that share something, or a reducer that cannot join parts: one program.
-    is_whole = smoothing is not None or len(network.names) <= NODES or not is_apart(network)
-    if not is_whole and type(reducer).joined is not AbstractReducer.joined:
+    # Many nodes that share nothing go in parts, where the reducer has a method of its own to join their results.
+    can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
+    if can_be_split and type(reducer).joined is not AbstractReducer.joined:
         return _simulate_in_parts(network, inputs, key, reducer, (first_run, runs, chunk), progress, precision)
     code = try_native(lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision))
     if code is None:
