@@ -105,7 +105,8 @@ def certify_boundedness(network: Network) -> Boundedness:
     instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
     links = _join_links(network, len(a))
-    # By rows of known gain on all of x; or, which are more, on the modes alone that do not decay.
+    # Used are the sums of what arrives whose gain on all of x is known. If that certifies nothing: the sums whose gain
+    # on the modes that do not decay is known, of which there are more.
     growing = _find_unstable_modes(a)
     for space in (np.eye(len(a)), growing):
         known = _group_losses(a, q, links, space)
@@ -121,7 +122,7 @@ def certify_boundedness(network: Network) -> Boundedness:
                 gains=known.map_gains(gains),
                 bound=bound,
             )
-    # Not certified, by the last of these: is there an unstable mode that losses hide?
+    # Not certified. From here on `known` is of the modes that do not decay: do losses hide one of them?
     unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
     verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
     return Boundedness(
@@ -151,7 +152,8 @@ def _join_links(network: Network, states: int) -> JointLinks:
             raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
-    # Modes that can occur: entries of p (I + T)^modes, which counts the ways from the initial law p, are positive.
+    # Modes that can occur. Entry j of p (I + T)^M, with p the initial law, T the chain and M its number of modes, sums
+    # the weights of all ways to mode j in at most M steps; it is positive if there is one.
     happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
     return JointLinks(
         initial=initial[happens],
@@ -207,9 +209,10 @@ class KnownLosses(NamedTuple):
 
 
 def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownLosses:
-    """Return the outcomes by kind of losses, each with the sums of what arrives whose gain on a subspace of x is known.
+    """Return what a receiver can use in each kind of losses: the sums of what arrives of known gain on a subspace of x.
 
-    Modes that look the same to the receiver are one kind: a gain that differs between them is unknown.
+    A kind of losses is a pattern of which components arrive, all that the receiver sees of the channel's mode. Gains
+    that differ between modes of one kind are unknown.
 
     Args:
         a: A (n, n).
@@ -217,15 +220,15 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
         links: joint model of all links.
         space: basis of the subspace, one column each.
     """
-    # Cases, one for each outcome of each mode: its mode i, and its flags of what arrives.
+    # All outcomes of all modes one after another: of each its mode, and its pattern of what arrives.
     outcomes = [outcome for of_mode in links.outcomes for outcome in of_mode]
     mode = np.array([i for i, of_mode in enumerate(links.outcomes) for _ in of_mode])
-    flags = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
-    # Kinds of losses, which kind each case is, and the sums of rows with known gain in each kind.
-    kinds = list(dict.fromkeys(flags))
-    kind_of_case = np.array([kinds.index(arrived) for arrived in flags])
+    patterns = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
+    # Kinds of losses, which kind each outcome is, and the sums of known gain in each kind.
+    kinds = list(dict.fromkeys(patterns))
+    kind_of_outcome = np.array([kinds.index(pattern) for pattern in patterns])
     parts = [
-        _find_known_sums([o for o, arrived in zip(outcomes, flags, strict=True) if arrived == kind], links, space)
+        _find_known_sums([o for o, pattern in zip(outcomes, patterns, strict=True) if pattern == kind], links, space)
         for kind in kinds
     ]
     # Chain of (mode, outcome), with its long-run law.
@@ -233,9 +236,9 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(
-        parts[kind].find_noise_of_sums(outcome, links) for outcome, kind in zip(outcomes, kind_of_case, strict=True)
+        parts[kind].find_noise_of_sums(outcome, links) for outcome, kind in zip(outcomes, kind_of_outcome, strict=True)
     )
-    system = KnownLossSystem(a, q, chain, law, kind_of_case, tuple(part.rows for part in parts), noises)
+    system = KnownLossSystem(a, q, chain, law, kind_of_outcome, tuple(part.rows for part in parts), noises)
     return KnownLosses(system, kinds, parts)
 
 
@@ -280,7 +283,7 @@ def _find_known_sums(
     G is the random gain of mean M, H the sensors' matrix, Y (n, d) the basis `space` of the states that matter.
     `alike`: the outcomes, in which the same components arrive.
     """
-    # E G, and E[G_ia G_jb] as [i, j, a, b], of each outcome; the last column of G is its offset. M over all of them.
+    # E G, and E[G_ia G_jb] as [i, j, a, b], of each outcome; the last column of G is its offset. M is their mean.
     moments = [second_moments(outcome.map) for outcome in alike]
     mean = np.mean([mean_of_outcome for mean_of_outcome, _ in moments], axis=0)
     arrived = np.flatnonzero(alike[0].arrived)
@@ -292,10 +295,11 @@ def _find_known_sums(
     scale = np.sqrt(np.diag(second)[arrived])
     scale = np.where(scale > 0, scale, 1.0)
     spread = (second - about)[np.ix_(arrived, arrived)] / scale / scale[:, None]
-    # Its eigenvectors of eigenvalue zero are sums of known gain.
+    # Its eigenvectors of eigenvalue zero, taken back to the units of what arrives, are the sums of known gain.
     values, vectors = np.linalg.eigh(spread)
-    combine = np.zeros((int(np.sum(values <= CERTAIN)), len(mean)))
-    combine[:, arrived] = vectors[:, values <= CERTAIN].T / scale
+    is_known = values <= CERTAIN
+    combine = np.zeros((int(np.sum(is_known)), len(mean)))
+    combine[:, arrived] = vectors[:, is_known].T / scale
     offset_is_known = all(np.array_equal(mean_of_outcome[:, -1], mean[:, -1]) for mean_of_outcome, _ in moments)
     all_states = space.shape[1] == len(space)
     return KnownGainSums(

@@ -79,7 +79,7 @@ def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.n
     parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
     modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
     for name, place in network.places.items():
-        # Of nodes' filters (..., filter, node, M).
+        # Of nodes' filters (..., filter, node, M), where the batch has estimates of their kind.
         if place.kind < len(parts) and parts[place.kind].modes is not None:
             modes[name] = np.asarray(parts[place.kind].modes)[..., place.filter, place.node, :]
     return modes
@@ -112,10 +112,11 @@ def split_by_name(
     parts = batch["estimates"]
     kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
     for (group, filters), estimate in zip(kinds, parts, strict=True):
+        # The axes of filters and nodes first, to go through them.
         values = np.moveaxis(np.asarray(read(estimate)), (axis, axis + 1), (0, 1))
-        for name, rows in zip(filters, values, strict=True):
-            for node, row in zip(network.groups[group], rows, strict=True):
-                by_node[node][name] = row
+        for name, values_of_filter in zip(filters, values, strict=True):
+            for node, value in zip(network.groups[group], values_of_filter, strict=True):
+                by_node[node][name] = value
     if network.fused:
         by_node[FUSED] = {name: np.asarray(read(estimate)) for name, estimate in batch["fused"].items()}
     return by_node

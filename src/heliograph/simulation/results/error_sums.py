@@ -59,8 +59,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def of_step(self, step: PyTree) -> OfStep:
         """Return what is summed of a step: products of errors, e' B^-1 e, claimed covariances, and flags of failures.
 
-        `step`: as of `AbstractReducer`. Estimates of all kinds, then fused ones by name, lie along one axis `part`, but
-        claimed covariances, which are a tuple by kind.
+        `step`: as of `AbstractReducer`. Estimates of all kinds, then fused ones by name, lie along one axis `part`.
+        Claimed covariances alone stay apart, a tuple by kind, since all runs may share those of one kind.
         """
         truth = jnp.asarray(step["truth"])
         parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
@@ -93,7 +93,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
             common: for each of these whether all runs share it, so that it is the value of one run.
             count: number of runs in each batch.
         """
-        # Values that all runs share count once per run; but for claimed covariances, which stay apart below.
+        # A value that all runs share counts once for each run of a batch. Claimed covariances are treated below.
         is_shared = common.sums["claimed"]
         totals, ever = jax.tree.map(
             lambda leaf, is_common: leaf[..., None] * count if is_common else leaf,
@@ -103,22 +103,23 @@ class Statistics(AbstractReducer[StatisticsByName]):
         # Order of the kinds: those whose claimed covariance differs between runs come first (False < True).
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(is_shared)), key=is_shared.__getitem__))
-        # The same order for the columns of all other sums, each kind's estimates side by side.
+        # The same order for the parts of all other sums, in which each kind's estimates are side by side.
         sizes = [values.shape[1] for values in claimed]
-        columns_of_kind = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        columns = np.concatenate([columns_of_kind[i] for i in order])
-        # Claimed covariances by run, and of all runs; each begins with an array of none, since there may be none.
+        parts_of_kind = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        parts = np.concatenate([parts_of_kind[i] for i in order])
+        # Claimed covariances by run, and of all runs. Each list begins with an empty array, so that it can be joined
+        # where no kind is in it.
         steps, _, pairs, _ = totals["pairs"].shape
         by_run = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not is_shared[i])]
         of_all = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if is_shared[i])]
         return RunSums(
             runs=count,
-            pairs=totals["pairs"][:, columns],
-            nees=totals["nees"][:, columns],
+            pairs=totals["pairs"][:, parts],
+            nees=totals["nees"][:, parts],
             claimed=np.concatenate(by_run, axis=1),
             shared=np.concatenate(of_all, axis=1),
-            failed=np.sum(totals["failed"], axis=-1)[:, :, columns],
-            failed_runs=np.sum(ever, axis=-1)[:, None, columns],
+            failed=np.sum(totals["failed"], axis=-1)[:, :, parts],
+            failed_runs=np.sum(ever, axis=-1)[:, None, parts],
             uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), totals["uplinks"]),
             order=order,
             by_run=is_shared.count(False),
@@ -134,7 +135,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         count, parts = _split_sums(carry, [(len(kind.filters), len(network.groups[kind.group])) for kind in all_kinds])
         of_kinds, of_fused = parts[: len(all_kinds)], parts[len(all_kinds) :]
         named = {"estimates": of_kinds, "fused": dict(zip(sorted(network.fused), of_fused, strict=True))}
-        # Each sum by node and filter; the number is its axis of filters, before that of nodes.
+        # Each sum by node and filter. Of a sum (..., filter, node, pair) the axis of filters is -3, without pairs -2.
         filter_axes = _FilterSums(pairs=-3, nees=-2, claimed=-3, failed=-2, failed_runs=-2)
         sums_by_name = [split_by_name(network, named, itemgetter(i), axis) for i, axis in enumerate(filter_axes)]
         # Statistics with their claims, then those of the quantizers.
@@ -201,25 +202,33 @@ def _split_sums(carry: RunSums, kinds: list[tuple[int, int]]) -> tuple[np.ndarra
 
     `kinds`: numbers of filters and of nodes of each kind; estimates beyond them are fused ones.
     """
-    # The axis of batches first, and the two failures: views, in which batches are last in memory.
+    # The axis of batches first, then time, then parts; of failures their two sorts stand in place of batches.
     sums = carry.runs, carry.pairs, carry.nees, carry.claimed
     count, pairs, nees, varying = (np.moveaxis(np.asarray(values), -1, 0) for values in sums)
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     # Mean claimed covariances: by batch where they differ between runs, else the same for all batches.
     varying = varying / np.maximum(count, 1.0).reshape(-1, *[1] * (varying.ndim - 1))
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
+    first_shared = varying.shape[2]  # the first part whose covariances all runs share
     split, start = {}, 0
-    # Places of each kind's estimates along the axis of parts, in the order of the sums.
+    # Each kind, in the order of the sums, has the next filters times nodes parts; a fused estimate has one.
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
-        rows = slice(start, start + int(np.prod(axes)))
+        parts = slice(start, start + int(np.prod(axes)))
         if position < carry.by_run:
-            claimed = varying[:, :, rows]
-        else:  # the shared ones are counted from the first of them
-            claimed = shared[:, :, rows.start - varying.shape[2] : rows.stop - varying.shape[2]]
-        of_kind = pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows]
+            claimed = varying[:, :, parts]
+        else:
+            claimed = shared[:, :, parts.start - first_shared : parts.stop - first_shared]
+        of_kind = _FilterSums(
+            pairs=pairs[:, :, parts],
+            nees=nees[:, :, parts],
+            claimed=claimed,
+            failed=failed[:, :, parts],
+            failed_runs=failed_runs[:, :, parts],
+        )
+        # The axis of parts becomes those of filters and nodes, or none of what is fused.
         split[i] = _FilterSums(*(values.reshape(*values.shape[:2], *axes, *values.shape[3:]) for values in of_kind))
-        start = rows.stop
+        start = parts.stop
     return count, [split[i] for i in range(len(split))]
 
 
@@ -242,7 +251,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", show_value((node, name)))
     estimate = record.estimates[node][name]
-    # Sums as of a simulation in which this is the only estimate, a fused one; runs are dealt to batches.
+    # Sums as of a simulation in which this is the only estimate, a fused one. Run r belongs to batch r mod BATCHES.
     arrays = (np.asarray(values, dtype=float) for values in (record.truth, estimate.mean, estimate.covariance))
     step: OfStep = over_runs(partial(_reduce_run, attitude=estimate.attitude), *arrays)
     sums, ever = jax.tree.map(_sum_batches, (step.sums, step.ever))

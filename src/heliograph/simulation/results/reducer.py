@@ -158,8 +158,9 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         time: of the steps.
     """
     measurements = split_measurements(network, batch["measurements"])
-    mean = split_by_name(network, batch, attrgetter("mean"), -3)
-    covariance = split_by_name(network, batch, attrgetter("covariance"), -4)
+    # The axis of filters is the third from last of means (..., filter, node, n), the fourth of covariances.
+    mean = split_by_name(network, batch, attrgetter("mean"), axis=-3)
+    covariance = split_by_name(network, batch, attrgetter("covariance"), axis=-4)
     modes, attitude = collect_modes(network, batch), first(network.plant).manifold.rotations
     estimates = {
         node: {

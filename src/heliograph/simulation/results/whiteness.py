@@ -70,20 +70,22 @@ class MemoryTest:
             raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
         if np.isinf(white).any():
             raise fail("data", "innovations that are finite numbers of their deviations", "infinite ones")
-        # Correlations are the same in any unit: here one in which no square is too large for a number.
+        # Correlations are the same in any unit: here a power of two near the largest number, so that no square
+        # overflows.
         _, exponent = np.frexp(np.nanmax(np.abs(white)))
         unit = 2.0 ** (int(exponent) - 1)
         white = white / unit
         # Correlations and their standard errors by lag.
         size, size_error = average_correlated(_average_components(white**2))
-        parts = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
-        correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
-        # Lag 1 by itself: Gaussian; without an error, known.
+        by_lag = [average_correlated(_average_components(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+        correlation, error = (np.array(column) / size for column in zip(*by_lag, strict=True))
+        # Lag 1 by itself: Gaussian. Without an error it is known, and is 0 or not.
         if error[0] > 0:
             p_value = float(2 * scipy.special.ndtr(-abs(correlation[0]) / error[0]))
         else:
             p_value = float(correlation[0] == 0)
-        # All together: sum of squares in errors, chi-squared; an error is at least that of as many independent rows.
+        # All lags together: their squares in units of their errors have a chi-squared sum. No error is taken to be
+        # below that of as many independent rows.
         rows = np.count_nonzero(~np.isnan(white).all(axis=1))
         in_errors = correlation / np.maximum(error, 1 / np.sqrt(rows))
         # Share of the variance that the best linear prediction from earlier ones takes (Yule and Walker).

@@ -74,13 +74,16 @@ class FilterColumns(NamedTuple):
 def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterColumns, ...]:
     """Return the columns of each filter's outputs in rows that are laid out so.
 
-    They are found from a row that holds the numbers of its columns, read by name as outputs are.
+    They are found from a row 0, 1, 2, ...: taken apart by name as outputs are, it gives the columns in their places.
     """
     numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
-    mean = split_by_name(network, numbered, attrgetter("mean"), -3)
-    covariance = split_by_name(network, numbered, attrgetter("covariance"), -4)
+    # The axis of filters is the third from last of means (filter, node, n), the fourth of covariances.
+    mean = split_by_name(network, numbered, attrgetter("mean"), axis=-3)
+    covariance = split_by_name(network, numbered, attrgetter("covariance"), axis=-4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
-    modes = {name: (int(of[0]), int(of[-1]) + 1) for name, of in collect_modes(network, numbered).items()}
+    modes = {
+        name: (int(columns[0]), int(columns[-1]) + 1) for name, columns in collect_modes(network, numbered).items()
+    }
     tested = {(FUSED, name): TestColumns(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(
         FilterColumns(

@@ -26,17 +26,19 @@ def simulate_trajectories(
         keys: of the runs (run,).
         rows: what the steps are given, with a leading axis of time; common to all runs.
     """
+    # Leaves of the first states; `start_varies` marks those that differ between runs.
     start, start_varies, tree = _start_runs(init, keys)
     example_row = jax.tree.map(lambda leaf: leaf[0], rows)
-    example_state = [leaf[..., 0] if v else leaf for leaf, v in zip(start, start_varies, strict=True)]
-    count = len(example_state)  # results of a step: so many leaves of the next state, then the outputs'
+    example_state = [leaf[..., 0] if varies else leaf for leaf, varies in zip(start, start_varies, strict=True)]
+    count = len(example_state)  # a step's results are so many leaves of the next state, then those of the outputs
     # One run's step, without operations that no result needs.
     traced, (_, output_shape) = jax.make_jaxpr(
         lambda state, key, row: step(jax.tree.unflatten(tree, state), key, row), return_shape=True
     )(example_state, keys[0], example_row)
     body = _drop_unused(traced)
     row_varies = [False] * len(jax.tree.leaves(example_row))
-    # Parts of the state that depend on the key at some step, as a fixed point; then those of the outputs.
+    # Leaves of the state that differ between runs at some step: marks are passed through the step until no leaf is
+    # marked any more. Then leaves of the outputs. The key, marked True, differs always.
     state_varies = _find_fixed_point(
         lambda marks: _mark_dependent_results(body, [*marks, True, *row_varies])[:count], start_varies
     )
@@ -54,8 +56,7 @@ def simulate_trajectories(
     begin = [jnp.broadcast_to(leaf[..., None], (*leaf.shape, len(keys))) if later and not now else leaf
              for leaf, now, later in zip(start, start_varies, state_varies, strict=True)]  # fmt: skip
     _, outcome = jax.lax.scan(step_all, begin, rows)
-    # The axis of runs first again.
-    outputs = [jnp.moveaxis(leaf, -1, 0) if v else leaf[None] for leaf, v in zip(outcome, output_varies, strict=True)]
+    outputs = _put_runs_first(outcome, output_varies)
     return jax.tree.unflatten(jax.tree.structure(output_shape), outputs)
 
 
@@ -67,21 +68,22 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    of_first = [leaf[0] for leaf in leaves]
+    of_first_run = [leaf[0] for leaf in leaves]
     traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
-        *of_first
+        *of_first_run
     )
-    # Which results depend on values of single runs: a program of one result alone still needs such an argument.
+    # A result differs between runs if the program, cut to that result alone, still needs an argument that does.
     results = range(len(traced.jaxpr.outvars))
     result_varies = []
     for i in results:
-        _, needed = dce_jaxpr(traced.jaxpr, [i == j for j in results])
-        result_varies.append(any(v and n for v, n in zip(varies, needed, strict=True)))
+        _, is_needed = dce_jaxpr(traced.jaxpr, [i == j for j in results])
+        result_varies.append(any(differs and needed for differs, needed in zip(varies, is_needed, strict=True)))
     # The axis of runs last inside, first outside.
     apply = jax.vmap(jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(result_varies), axis_size=runs)
-    arguments = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
-    outcome = apply(*arguments)
-    outputs = [jnp.moveaxis(leaf, -1, 0) if v else leaf[None] for leaf, v in zip(outcome, result_varies, strict=True)]
+    arguments = [
+        jnp.moveaxis(leaf, 0, -1) if differs else leaf[0] for leaf, differs in zip(leaves, varies, strict=True)
+    ]
+    outputs = _put_runs_first(apply(*arguments), result_varies)
     return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
 
@@ -129,6 +131,11 @@ def _find_fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool
     """Return the marks that `step` does not change any more, from `marks` on; marks are only added."""
     more = [before or after for before, after in zip(marks, step(marks), strict=True)]
     return marks if more == marks else _find_fixed_point(step, more)
+
+
+def _put_runs_first(leaves: Sequence[jax.Array], varies: Sequence[bool]) -> list[jax.Array]:
+    """Return leaves (..., run), or (...) of what all runs share, as (run, ...) and (1, ...)."""
+    return [jnp.moveaxis(leaf, -1, 0) if differs else leaf[None] for leaf, differs in zip(leaves, varies, strict=True)]
 
 
 def _axes(varies: Sequence[bool]) -> list[int | None]:
