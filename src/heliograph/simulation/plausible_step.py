@@ -69,10 +69,10 @@ def step_plausibly(
     Returns:
         The states after the step, and its outputs, as of `AllFilters.step`.
     """
-    # Outputs' shapes, for the zeros before the first turn, in which no filter skips anything.
-    by_kind = [jnp.zeros((a.count, a.nodes)) for a in filters.alike]
+    # The loop begins with outputs of zeros, in which nothing is implausible; their shapes are those of a step's.
+    by_kind = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.alike]
     none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
-    _, outputs = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, none_skipped)
+    _, output_shapes = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, none_skipped)
 
     def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
         """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
@@ -83,11 +83,12 @@ def step_plausibly(
         """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
         turn, (_, before) = carry
         after, outputs = _step(filters, states, z, u, k, drawn, read_reasons(before))
+        # The first turn judges all data, the second what is left of them: the first's judgements stay.
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
         return turn + 1, (after, outputs)
 
-    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outputs)
+    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), output_shapes)
     stepped: Stepped
     _, stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))
     return stepped
@@ -173,15 +174,15 @@ def describe_doubts(
         refused: rows that all filters of a node refuse, by node, with the reason.
         u: inputs of the plant.
     """
-    # Rows that are implausible for all filters of a node.
+    # Rows that are implausible for all filters of a node; the first is explained, by a function's fault if any has one.
     faults = _FaultFinder(network, outputs, u)
     lines = []
     for node, by_row in refused.items():
-        row, why = next(iter(by_row.items()))
-        named = [faults.name_fault(node, name, row) for name in network.nodes[node].filters]
+        first_row, why = next(iter(by_row.items()))
+        named = [faults.name_fault(node, name, first_row) for name in network.nodes[node].filters]
         fault = next((words for words in named if words), "")
         lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
-    # Rows that a single filter skips, those of above aside.
+    # Rows that a single filter skips, those of above aside. Of the judgements of a kind one filter's at one node.
     judgements = {
         place: Judgement(*(field[:, at.filter, at.node] for field in outputs["judged"][at.kind]))
         for place, at in network.places.items()
@@ -192,15 +193,15 @@ def describe_doubts(
         reported = all_rows if node == FUSED else refused.get(node, {})
         rows = [int(k) for k in np.flatnonzero(judgement.reason > 0) if k not in reported]
         if rows:
-            row = rows[0]
-            reason, distance = np.asarray(judgement.reason)[row], np.asarray(judgement.distance)[row]
-            why = Judgement.describe(reason, distance) + faults.name_fault(node, name, row)
+            reason, distance = np.asarray(judgement.reason)[rows[0]], np.asarray(judgement.distance)[rows[0]]
+            why = Judgement.describe(reason, distance) + faults.name_fault(node, name, rows[0])
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
         votes = FilterJudges(network).read_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
-        lines += [f"inputs: {_format_rows(rows)} implausible: {INPUT}"] if rows else []
+        if rows:
+            lines.append(f"inputs: {_format_rows(rows)} implausible: {INPUT}")
     return lines
 
 
@@ -257,7 +258,8 @@ def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps 
         return []
     assert isinstance(node, Node)  # as it has a trigger
     channel = first(node.channel)
-    if channel.erases or channel.remembers or channel.outputs != len(node.outputs):
+    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
+    if not is_as_sent:
         return []
     # Each row that came whole against the one before it, `last`.
     forbidden, last = list[int](), None

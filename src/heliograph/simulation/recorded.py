@@ -130,7 +130,8 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     _warn_of_record(network, record, state)
-    # Where the rows end, for forecasts and later rows; numbered rows are one apart, as the first two say.
+    # Where the rows end, for forecasts and later rows. Rows without times are numbered: all are as far apart as the
+    # first two.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
@@ -233,9 +234,10 @@ def _filter_plausible(
 ) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
 
-    If there are any, the recording is first filtered step by step without them to find all rows; then, without those
-    that all filters of a node refuse, once again as a recording that never had them. Of what central filters refuse
-    one node is to blame in each row, and the others' values are judged again without it.
+    If there are any, the recording is filtered first with judgements: at each step a filter leaves out what it finds
+    implausible. The rows that all filters of a node refuse are then taken out, and the rest is filtered again as a
+    recording that never had them, until no new row is refused. Of a row that central filters refuse one node is to
+    blame, and the others' values are judged again without it.
 
     Args:
         network: the network.
@@ -258,13 +260,13 @@ def _filter_plausible(
         outputs = first_time = filter_rows(task, group_measurements(), judged=True)
         refused = dict[str, dict[int, str]]()
         while new := _find_refused_rows(network, outputs, z, group_measurements(), task, refused):
-            for name, rows in new.items():
-                refused[name] = dict(sorted((refused.get(name, {}) | rows).items()))
+            for name, reasons_by_row in new.items():
+                refused[name] = dict(sorted((refused.get(name, {}) | reasons_by_row).items()))
                 # Out of a copy of the measurements, since they are the caller's.
-                numbers = list(rows)
+                rows = list(reasons_by_row)
                 z[name] = z[name].copy()
-                left_out[name][numbers] += ~np.isnan(z[name][numbers]) * np.int8(number_of("implausible"))
-                z[name][numbers] = np.nan
+                left_out[name][rows] += ~np.isnan(z[name][rows]) * np.int8(number_of("implausible"))
+                z[name][rows] = np.nan
             again = filter_rows(task, group_measurements(), judged=False)
             outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again
         doubts = describe_doubts(network, first_time, refused, task.u)

@@ -290,7 +290,8 @@ class Mesh(Module):
         """
         information, traces = jax.vmap(invert)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         # Axes of the nodes: the last of a rule's arrays, the first of all else.
-        over_rows = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
+        over_nodes = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
+        # Bucket by bucket: nodes of about as many neighbours.
         by_bucket = []
         for bucket, bucket_ahead in zip(self.buckets, ahead or [()] * len(self.buckets), strict=True):
             rows, width = bucket.rows, bucket.width
@@ -305,10 +306,10 @@ class Mesh(Module):
             )
             if self.alpha is not None:
                 received = widen_for_events(received, self.alpha)
-            by_bucket.append(over_rows(bucket.rule, received, *(leaf[rows] for leaf in rest), bucket_ahead))
-        if len(by_bucket) == 1:
+            by_bucket.append(over_nodes(bucket.rule, received, *(leaf[rows] for leaf in rest), bucket_ahead))
+        if len(by_bucket) == 1:  # it has all nodes, in their order
             return by_bucket[0]
-        # Rows of one length again, in the order of the nodes.
+        # Padded to as many messages for all nodes, and in the order of the nodes.
         padded = [r._replace(parts=_pad_to_degree(r.parts, self.senders.shape[1])) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 

@@ -129,17 +129,17 @@ def mesh_errors(
     flags = _check_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = read_plant_inputs(network, inputs, len(flags))
-    actual, claimed, last = [], [], np.zeros(())
+    actual, claimed, last_joint = [], [], np.zeros(())
     for joint, covariances, claims in propagate_errors_over_time(mesh, flags, u):
         actual.append(covariances)
         claimed.append(claims)
-        last = joint
-    nodes, n = len(mesh.nodes), actual[0].shape[-1]
+        last_joint = joint
+    count, n = len(mesh.nodes), actual[0].shape[-1]
     return MeshErrors(
         nodes=mesh.nodes,
         actual=np.stack(actual),
         claimed=np.stack(claimed),
-        joint=last.reshape(nodes, n, nodes, n),
+        joint=last_joint.reshape(count, n, count, n),
         claim=find_claim_of_errors(fusion, network.meshes[fusion], network),
     )
 
@@ -156,20 +156,21 @@ def propagate_errors_over_time(
     """
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # At first all errors are x_0 - E x_0.
+    # Before any data all nodes have the same error, x_0 - E x_0.
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
-    nodes, n = start.mean.shape
-    joint = np.tile(initial_covariance, (nodes, nodes))
+    count, n = start.mean.shape
+    joint = np.tile(initial_covariance, (count, count))
     needs_joint = mesh.needs_joint
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
-        blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders)) if needs_joint else None
+        blocks = np.asarray(blocks_of(joint.reshape(count, n, count, n), mesh.senders)) if needs_joint else None
         with jax.enable_x64(True):
             step = to_numpy(_compute_step(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
         joint = _propagate_joint(mesh, joint, step, arrived)
         covariance, moments = step.gains.covariance, step.plant
-        actual = np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy()
-        yield joint, actual, actual if needs_joint else covariance
+        diagonal_blocks = np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy()
+        # Nodes that follow the joint covariance claim their part of it, the others the covariance of their rule.
+        yield joint, diagonal_blocks, diagonal_blocks if needs_joint else covariance
 
 
 @quickly_compiled
@@ -240,13 +241,14 @@ def best_possible(
         for k, u_k in enumerate(u):
             steps.append(to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k))))
             moments = steps[-1].plant
-    # Riccati recursions of all nodes side by side, oldest measurement first: P- = A P A' + Q, P = (P-^-1 + S)^-1.
+    # Riccati recursions of all nodes side by side, oldest measurement first, by roots: P- = A P A' + Q = V V' with
+    # V = (A P^1/2, Q^1/2), and P = (P-^-1 + S)^-1.
     count = len(mesh.nodes)
     root = roots_of(np.asarray(start.covariance))
-    for model, total in zip(steps, _sum_known_information(mesh, flags, steps), strict=True):
+    for model, information in zip(steps, _sum_known_information(mesh, flags, steps), strict=True):
         a, process = np.asarray(model.motion.matrix), roots_of(np.asarray(model.motion.noise))
         process = np.broadcast_to(process, (count, *process.shape))
-        root = observe_information(np.concatenate([a @ root, process], axis=-1), total).root
+        root = observe_information(np.concatenate([a @ root, process], axis=-1), information).root
     return covariance_of_root(root)
 
 
@@ -328,10 +330,10 @@ def freeze(
     u = read_plant_inputs(network, inputs, len(flags))
     # Mean of each neighbourhood's block of J, from which weights are made, over the last steps.
     total: np.ndarray | None = None
-    shape = (len(mesh.nodes), len(network.states)) * 2
+    by_nodes = (len(mesh.nodes), len(network.states)) * 2  # the shape of J as (node, n, node, n)
     for k, (joint, _, _) in enumerate(propagate_errors_over_time(mesh, flags, u)):
         if k >= len(flags) - last:
-            blocks = np.asarray(blocks_of(joint.reshape(shape), mesh.senders))
+            blocks = np.asarray(blocks_of(joint.reshape(by_nodes), mesh.senders))
             total = blocks if total is None else total + blocks
     assert total is not None  # since 1 <= last <= steps
     frozen = Fusion(old.filter, FrozenWeights(old.rule, total / last), neighbours=old.neighbours, link=old.link)

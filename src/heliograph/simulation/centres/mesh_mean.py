@@ -80,7 +80,7 @@ def mean_mesh_errors(
         ValueError: no such fusion, a rule whose gains remember losses (intersection), losses in bursts, too many
             neighbours.
     """
-    # Only gains that depend on what arrives at this step alone are independent of J.
+    # J may be averaged over losses only where gains depend on what arrives at this step alone, not on earlier losses.
     mesh = find_mesh(network, fusion)
     between = network.meshes[fusion]
     if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
@@ -91,26 +91,28 @@ def mean_mesh_errors(
     patterns, rows = _list_patterns(mesh, between)
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
-    # J_k -> J_k+1: gains of every pattern from J_k, then means over the patterns. At first all errors are x_0 - E x_0.
-    nodes, n = start.mean.shape
+    # J_k -> J_k+1: gains of every pattern from J_k, then means over the patterns. Before any data all nodes have the
+    # same error, x_0 - E x_0.
+    count, n = start.mean.shape
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
-    joint = np.tile(initial_covariance, (nodes, nodes))
+    joint = np.tile(initial_covariance, (count, count))
     errors = []
     for k, u_k in enumerate(u):
         with jax.enable_x64(True):
             step = to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k)))
-            blocks = np.asarray(blocks_of(joint.reshape(nodes, n, nodes, n), mesh.senders))
+            blocks = np.asarray(blocks_of(joint.reshape(count, n, count, n), mesh.senders))
             gains = to_numpy(_compute_gains(rows, covariance, blocks, patterns, step))
         joint, moments = _average_joint(mesh, joint, blocks, patterns, gains, step), step.plant
-        errors.append(np.einsum("iaib->iab", joint.reshape(nodes, n, nodes, n)).copy())
-        # Diffusion alone reads it, and there it is the same in every pattern of a node.
+        errors.append(np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy())
+        # The first pattern of each node stands for all: only diffusion reads this covariance, and by diffusion it is
+        # the same in every pattern of a node.
         covariance = np.asarray(gains.covariance)[patterns.start]
     return MeshErrors(
         nodes=mesh.nodes,
         actual=np.stack(errors),
         claimed=np.stack(errors),
-        joint=joint.reshape(nodes, n, nodes, n),
+        joint=joint.reshape(count, n, count, n),
         claim=find_claim_of_errors(fusion, between, network),
     )
 
@@ -182,14 +184,14 @@ def _average_joint(
     w = np.asarray(measurement_weights(gains.gain, patterns.present))
     # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
     mean_w = mean(w)
-    scattered = [
+    sparse_m, sparse_ws, sparse_w = (  # matrices (N, N) of all nodes
         scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), mean_w @ s[mesh.senders], mean_w)
-    ]
-    after = propagate_joint_covariance(joint, scattered[0], mean(f), q, *scattered[1:])
+    )
+    after = propagate_joint_covariance(joint, sparse_m, mean(f), q, sparse_ws, sparse_w)
     # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
     flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)  # M_r as one matrix
     inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
-    noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)
+    noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)  # sum_l W_rl S_l W_rl'
     diagonal = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
     blocks_after = after.reshape(count, n, count, n)  # a view: writing here changes `after`
     nodes = np.arange(count)

@@ -83,8 +83,8 @@ def gather_messages(
 ) -> ArrivingEstimates:  # fmt: skip
     """Return the estimates that arrive at a step.
 
-    One that saturates its quantizer never arrives; the measurement sent with it arrives at once or not at all. So data
-    decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
+    An estimate that saturates its quantizer never arrives; the measurement sent with it arrives at once or not at all.
+    So data decide what is fused: E[e_i e_i'] given that x was beyond the amplitude may be far above P_i.
 
     Args:
         mean: estimates of the nodes now (node, n).
@@ -104,7 +104,8 @@ def gather_messages(
     )
     # The message of age a from node j is row (1 + a) nodes + j; where none arrives, age 0 stands in and is not used.
     rows = jnp.asarray(senders) + len(mean) * (1 + jnp.maximum(ages[:, -1], 0))
-    # In place of an estimate that saturated, the receiver's own, which is a number; in place 0 its own in any case.
+    # An estimate that saturated is NaN. Its row becomes the receiver's own, a number, which is then not used. The first
+    # message is the receiver's own in any case.
     saturated = jnp.any(jnp.isnan(means), axis=1)[rows]
     rows = jnp.where(saturated, senders[:, :1], rows).at[:, 0].set(senders[:, 0])
     return ArrivingEstimates(
@@ -134,7 +135,7 @@ def step_messages_on_the_way(
         weighted: H_j' R_j^-1 (z_j - H_j m) of each node's measurement (node, n).
         information: H_j' R_j^-1 H_j (node, n, n).
     """
-    nodes, (ages, senders) = len(weighted), way.mean.shape[:2]
+    nodes, (ages, senders) = len(weighted), way.mean.shape[:2]  # numbers of nodes, of ages on the way, of senders
     a, shift = jnp.asarray(motion.matrix), jnp.asarray(motion.shift)
 
     def predict(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -146,7 +147,7 @@ def step_messages_on_the_way(
     covariance, _ = jax.vmap(correct_by_information)(predicted_covariance, information)
     innovation = weighted - jnp.einsum("iab,ib->ia", information, mean - common)
     mean = mean + jnp.einsum("iab,ib->ia", covariance, innovation)
-    # What was sent before, predicted.
+    # What was sent before, predicted; nothing where no message takes longer than a step.
     older_mean, older_covariance = predict(way.mean, way.covariance) if ages else way
 
     def put_before(older: jax.Array, now: jax.Array) -> jax.Array:

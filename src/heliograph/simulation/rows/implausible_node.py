@@ -37,13 +37,13 @@ def refuse_centrally(
     Returns:
         The rows of each node that is to blame, with the reason.
     """
-    # Each row once for each of these nodes that has a value in it, without the node's values.
+    # One trial for each implausible row and each of these nodes that has a value in it: the row without the node's.
     removals = [_Removal(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
     rows = np.array([removal.row for removal in removals], dtype=int)
     without = {name: values[rows] for name, values in z.items()}
     for i, removal in enumerate(removals):
         without[removal.node][i] = np.nan
-    # Whether the filters find the row plausible then.
+    # Whether the filters find the row plausible without the node.
     votes = _judge_rows(filters, before, np.concatenate(list(without.values()), axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
 

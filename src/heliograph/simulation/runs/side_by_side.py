@@ -59,10 +59,10 @@ def filter_step(
         skip: code of the reason not to use z, 0 if there is none: then nothing of it arrived, and where the prediction
             itself is no number the state before it stays. None: use z.
     """
-    # What is not used did not arrive.
+    # Data that are not used count as not arrived.
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
-    # With a smoother step, and a judgement of the same step.
     judgement, weighed = None, None
+    # With a smoother step; it has no judgement of its own, which is made by a step beside it.
     if smooths:
         if judges:
             *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)
@@ -77,8 +77,8 @@ def filter_step(
         after, estimate = filter.step(state, z, u, k)
     # A prediction that is no number leaves the state as it was.
     if skip is not None:
-        stays, known = skip == Reason.PREDICTION, (state, filter.estimate(state))
-        after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
+        stays, before = skip == Reason.PREDICTION, (state, filter.estimate(state))
+        after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), before, (after, estimate))
     return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
 
 
