@@ -156,6 +156,7 @@ def find_premise(network: HasNodes, name: str) -> Premise:
     """
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
+        # Limits without bounds refuse nothing but codes, which tell nothing of the state.
         limits = node.limits if node.limits is not None and node.limits.bounded else None
         return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     if network.common is not None:
@@ -164,6 +165,7 @@ def find_premise(network: HasNodes, name: str) -> Premise:
         )
     if network.relays is None:  # a node without a sensor
         return Premise(plant)
+    # Gains of the relays, each of which runs a single filter by a schedule.
     schedules = {
         relay: filter
         for relay in network.relays.relays
@@ -235,14 +237,15 @@ def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) ->
     rule = type(fusion.rule).__name__
     if fusion.quantizer is not None and not fusion.by_report:
         raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
-    parts = network.parts_of(fusion.filter)
+    parts = network.parts_of(fusion.filter)  # of each node that has a sensor: sensor, channel, filter
     if len(parts) < len(names):
         raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
-    # Along estimates, moments of the errors are known but not the plant's own.
-    if (fusion.by_report or fusion.rule.needs_plant_moments) and has_data_dependent_gains(parts):
-        (_, _, filter), *_ = parts.values()
+    # Where gains depend on data, moments of the errors are followed along the estimates, but not the plant's own.
+    needs_plant_moments = fusion.by_report or fusion.rule.needs_plant_moments
+    if needs_plant_moments and has_data_dependent_gains(parts):
+        _, _, first_filter = next(iter(parts.values()))
         raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
-                   type(filter).__name__)  # fmt: skip
+                   type(first_filter).__name__)  # fmt: skip
     claim = find_claim_of_informed_fusion(rule, network.plant, parts, shared=network.common is not None)
     if not fusion.by_report:
         return claim

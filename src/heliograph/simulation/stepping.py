@@ -208,27 +208,28 @@ class AllFilters(Module):
         following, of_fusions = self._step_fusions(
             (filter_states, quantizer_states, centre_states, exchange_states), z, estimates, u, k, drawn or {}
         )
-        fused = {name: output.estimate for name, (_, output) in stepped_centrally.items()} | of_fusions.fused
+        fused_centrally = {name: output.estimate for name, (_, output) in stepped_centrally.items()}
+        fused = fused_centrally | of_fusions.fused
         outputs: dict[str, PyTree] = {
             "estimates": (*estimates, *of_fusions.between_neighbours),
             "fused": fused,
             "uplinks": of_fusions.uplinks,
             "reports": of_fusions.reports,
         }
-        # Tests of the last step's fused estimates by what arrived now; those of this step are tested at the next.
+        # What arrived now tests the fused estimates of the last step; those of this step are tested at the next.
         distances = {
             name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
             for name, test in self.tests.items()
         }
-        tested = {name: following_prior(fused[name]) for name in self.tests}
+        tested_next = {name: following_prior(fused[name]) for name in self.tests}
         if self.judges:
             outputs["tested"] = distances
         # What else the filters' steps put out, under one name of the nodes' filters and another of central ones.
         for field, of_nodes, centrally in self._list_details():
             outputs[of_nodes] = tuple(getattr(output, field) for _, output in stepped)
             outputs[centrally] = {name: getattr(output, field) for name, (_, output) in stepped_centrally.items()}
-        central = {name: state for name, (state, _) in stepped_centrally.items()}
-        return (tuple(state for state, _ in stepped), central, *following, tested), outputs
+        central_after = {name: state for name, (state, _) in stepped_centrally.items()}
+        return (tuple(state for state, _ in stepped), central_after, *following, tested_next), outputs
 
     def _step_central_filters(
         self,
@@ -279,7 +280,7 @@ class AllFilters(Module):
         """
         filter_states, quantizer_states, centre_states, exchange_states = states
         fused, uplinks, reports, exchanges_after = (dict[str, PyTree]() for _ in range(4))
-        # Rules that know nothing of the nodes, through their quantizers.
+        # Rules that know nothing of the nodes, on estimates through the nodes' quantizers.
         quantizers_after, centres_after = list[PyTree](), list[PyTree]()
         for fusion, state in zip(self.fusions, quantizer_states, strict=True):
             following, outcome, traffic = fusion.step(state, estimates, k)
@@ -301,7 +302,7 @@ class AllFilters(Module):
         # Fusions between neighbours, which have an estimate at each node.
         between_neighbours = list[Estimate]()
         for name, mesh in sorted(self.meshes.items()):
-            # Drawn: flags of what arrives, or these and the weights that were computed from them ahead.
+            # What is drawn: flags of what arrives, or a pair of these and of weights that were computed before.
             arrivals = drawn[name] if name in drawn else mesh.edges.lossless()
             flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
             exchanges_after[name], of_mesh = mesh.step(exchange_states[name], z, jnp.asarray(flags), u, k, ahead)

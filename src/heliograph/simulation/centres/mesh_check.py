@@ -33,6 +33,8 @@ from heliograph.simulation.node import HasNodes, Node
 MODE = 1e-6  # a mode of 1 - MODE counts as one that does not decay: double ones are computed to half of the digits
 CUTS = 200  # most nodes of which losses are judged: one minimal cut for each
 UNIT = 1e5  # whole units of one e-fold of a loss's probability, for integer capacities
+WIDEST = 1e8  # largest capacity of an edge of the graph, in these units
+UNCUT = 2**30  # capacity of an edge that no least cut takes
 RANK = 1e-9  # relative: singular values of a mode's observability below are zero
 
 
@@ -55,23 +57,23 @@ def check_mesh(name: str, fusion: Fusion, network: HasNodes) -> None:
     # Relays, and nodes that share a channel, have correlated noises.
     if network.relays is not None or network.common is not None:
         sharing = [node for node in network.mesh_nodes(name) if network.nodes[node].received][:5]
-        kind = "relays" if network.relays is not None else f"{sharing}, which share a channel: stack their measurements"
-        raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", kind)
+        got = "relays" if network.relays is not None else f"{sharing}, which share a channel: stack their measurements"
+        raise fail(what, "nodes with a sensor and a channel each, whose noises are uncorrelated", got)
     if not isinstance(first(network.plant), LinearPlant):
         raise fail(what, "a LinearPlant", type(first(network.plant)).__name__)
-    # Nodes have the filter or no sensor, and names of their own for the result.
-    for node in network.mesh_nodes(name):
-        here = network.nodes[node]
-        if isinstance(here, Node) and fusion.filter not in here.filters:
-            raise fail(f"{what}: node {node!r}", f"the filter {fusion.filter!r}", list(here.filters) or "none")
-        if name in here.filters:
-            raise fail(f"{what}: node {node!r}", "a name that no filter has", repr(name))
+    # A node has the fusion's filter, or no sensor; and none of its filters has the name of the fusion.
+    for node_name in network.mesh_nodes(name):
+        node = network.nodes[node_name]
+        if isinstance(node, Node) and fusion.filter not in node.filters:
+            raise fail(f"{what}: node {node_name!r}", f"the filter {fusion.filter!r}", list(node.filters) or "none")
+        if name in node.filters:
+            raise fail(f"{what}: node {node_name!r}", "a name that no filter has", repr(name))
     # Rule and messages; then what the rule and the claim refuse themselves.
     _check_rule(what, fusion, network)
     graph = graph_of(neighbours, network.mesh_nodes(name))
     _check_messages(what, fusion, network, graph)
-    fusion.rule.placed(graph)
-    find_claim_of_mesh(name, fusion, network)
+    fusion.rule.placed(graph)  # raises for shares or blocks that do not fit the graph
+    find_claim_of_mesh(name, fusion, network)  # raises for filters that the rule refuses
     # Whether errors stay bounded.
     _check_detectability(what, name, fusion, network)
     _check_losses(what, fusion, network, graph)
@@ -115,14 +117,15 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
     `what`: the fusion, for errors.
     """
     rule, kind = fusion.rule, type(fusion.rule)
+    intersects = not rule.needs_joint and not isinstance(rule, FrozenWeights)
     if not rule.between_neighbours:
         raise fail(what, "a rule such as CovarianceIntersection() or MatrixWeights()", kind.__name__)
     if getattr(rule, "with_mean", False):
         raise fail(f"{what} by {kind.__name__}", "with_mean=False", True)
-    if fusion.rounds > 1 and (rule.needs_joint or isinstance(rule, FrozenWeights)):
+    if fusion.rounds > 1 and not intersects:
         raise fail(f"{what} by {kind.__name__}", "one round (more need a rule that intersects)", fusion.rounds)
-    # With events no matrix may depend on what is sent.
-    if fusion.alpha is not None and (rule.needs_joint or isinstance(rule, FrozenWeights)):
+    # Where a node sends only what has changed (an event), data decide what arrives: a joint covariance would be wrong.
+    if fusion.alpha is not None and not intersects:
         raise fail(f"{what} by {kind.__name__}", "a rule that intersects, where there are events", fusion.alpha)
     if fusion.alpha is not None and fusion.rounds > 1:
         raise fail(what, "one round, where there are events", f"{fusion.rounds} rounds")
@@ -130,7 +133,7 @@ def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
     start = np.asarray(first(network.plant).initial_covariance)
     scale = np.sqrt(np.diagonal(start))
     singular = np.any(scale == 0) or np.linalg.eigvalsh(start / np.outer(scale, scale))[0] < RANK
-    if singular and not rule.needs_joint and not isinstance(rule, FrozenWeights):
+    if singular and intersects:
         raise fail(f"{what} by {kind.__name__}", "a regular initial covariance of the plant", "a singular one")
 
 
@@ -162,24 +165,24 @@ def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes
     sensors or channels vary over time. `what`: the fusion of this `name`, for errors.
     """
     # Models that do not vary.
-    nodes = network.mesh_nodes(name)
-    sensors = [network.nodes[node] for node in nodes]
-    observations = [(n.sensor, n.channel) for n in sensors if isinstance(n, Node)]
-    varying = [model for pair in observations for model in pair] + [network.plant]
-    if any(isinstance(model, OverTime) for model in varying):
+    names = network.mesh_nodes(name)
+    nodes = [network.nodes[node] for node in names]
+    observations = [(node.sensor, node.channel) for node in nodes if isinstance(node, Node)]
+    models = [model for pair in observations for model in pair] + [network.plant]
+    if any(isinstance(model, OverTime) for model in models):
         return
     a = np.asarray(first(network.plant).matrix)
     n = len(a)
     refuse_angles(what, network.plant, *(sensor for sensor, _ in observations))
     # H'H of each node (node, n, n), H its mean gain with rows of unit length.
-    squares = np.zeros((len(nodes), n, n))
-    for i, sensor in enumerate(sensors):
-        if isinstance(sensor, Node):
-            h, noise = _model_node(sensor)
+    squares = np.zeros((len(names), n, n))
+    for i, node in enumerate(nodes):
+        if isinstance(node, Node):
+            h, noise = _model_node(node)
             squares[i] = _scale_rows(h).T @ _scale_rows(h)
-            _check_noise_is_regular(f"{what}: node {nodes[i]!r}", noise)
+            _check_noise_is_regular(f"{what}: node {names[i]!r}", noise)
     # Unstable modes that nobody upstream observes are refused, decaying ones warned of.
-    without_unstable, without_decaying = _list_unseeing_nodes(graph_of(fusion.neighbours or {}, nodes), a, squares)
+    without_unstable, without_decaying = _list_unseeing_nodes(graph_of(fusion.neighbours or {}, names), a, squares)
     if without_unstable:
         some = ", ".join(map(repr, without_unstable[:5])) + (" and more" if len(without_unstable) > 5 else "")
         raise fail(
@@ -204,24 +207,25 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
     rates = [find_loss_decay(channel) for channel in links_by_edge(link, graph).values()]
     if any(rate is None for rate in rates):
         return
-    # Capacities -log p in whole units, at most 1e8: of an edge that loses nothing they are as good as infinite.
+    # Capacities -log p in whole units, as the search for a flow needs them; at most WIDEST, as good as infinite, of an
+    # edge that loses nothing.
     exact = np.array([-np.log(max(float(rate or 0.0), 1e-300)) for rate in rates])
-    units = np.minimum(np.round(UNIT * exact), 1e8).astype(np.int32)
+    capacities = np.minimum(np.round(UNIT * exact), WIDEST).astype(np.int32)
     # Of each unstable mode the least cut between the nodes that observe it and each other node.
     values, vectors = np.linalg.eig(np.asarray(first(network.plant).matrix))
     for value, vector in zip(values, vectors.T, strict=True):
         if abs(value) <= 1 + MODE:
             continue
         sees = np.array([_measures_mode(network.nodes[name], vector) for name in names])
-        # One source more, with an edge to each node that measures the mode, which no cut takes.
+        # One node more, the source, with an edge to each node that measures the mode: too wide for a least cut.
         source = len(names)
-        rows = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
-        columns = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
-        data = np.concatenate([units, np.full(sees.sum(), 2**30, dtype=np.int32)]).astype(np.int32)
-        flow = scipy.sparse.csr_array((data, (rows, columns)), shape=(source + 1, source + 1))
+        senders = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
+        receivers = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
+        widths = np.concatenate([capacities, np.full(sees.sum(), UNCUT, dtype=np.int32)]).astype(np.int32)
+        edges = scipy.sparse.csr_array((widths, (senders, receivers)), shape=(source + 1, source + 1))
         for i in np.flatnonzero(~sees):
-            # |lambda|^2 p < 1 where the cut -log p is above 2 log |lambda|.
-            cut = scipy.sparse.csgraph.maximum_flow(flow, source, int(i)).flow_value / UNIT
+            # The least cut, which is the largest flow. |lambda|^2 p < 1 where -log p is above 2 log |lambda|.
+            cut = scipy.sparse.csgraph.maximum_flow(edges, source, int(i)).flow_value / UNIT
             if cut <= 2 * np.log(abs(value)) * (1 - MODE):
                 raise fail(what, f"losses below {1 / abs(value) ** 2:.3g} in all of what node {names[i]!r} learns of a "
                            f"mode of {abs(value):.3g}", f"{np.exp(-cut):.3g}")  # fmt: skip
@@ -311,7 +315,7 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
     steady = all(_is_steady(node) for node in nodes if isinstance(node, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
-    # A node without a sensor has a row of zeros, and noise that does not matter.
+    # A node without a sensor measures zeros, with a noise that does not matter.
     models = [_model_node(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     shares = np.asarray(fusion.rule.placed(graph).shares).T

@@ -123,9 +123,9 @@ def mesh_errors(
     """
     mesh = find_mesh(network, fusion)
     if mesh.alpha is not None or mesh.quantizer is not None:
-        by_data = "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which data decide what is sent"
+        got = "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which data decide what is sent"
         raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step, as they are",
-                   by_data)  # fmt: skip
+                   got)  # fmt: skip
     flags = _check_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = read_plant_inputs(network, inputs, len(flags))

@@ -123,11 +123,11 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
         """Smooth rows `begin` to `stop` from the last one back; return the estimates after the first."""
         sweep: BackwardSweep = static.filled(numbers)
         begin, stop = span
-        last = stop - 1, history.step[stop - 1]
+        last_row = stop - 1, history.step[stop - 1]
         # How many steps lead from the last row back to row `begin`.
         count = stop - 1 - begin if dt is not None else history.step[stop - 1] - history.step[begin]
-        # Zeros of the shapes of a smoother step, without computing one.
-        shapes = jax.eval_shape(lambda: step_into(sweep, history, last))
+        # The loop begins with zeros in the shapes of a smoother step, which are found without computing one.
+        shapes = jax.eval_shape(lambda: step_into(sweep, history, last_row))
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
         def step_back(
@@ -139,12 +139,13 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
             """
             place, steps_after, later = carry
             steps = step_into(sweep, history, place)
-            passed = _map_filters(lambda step, later: step.back(later), steps_after, later)
+            # From the estimate after the step, or at the last row from the filter's own.
+            moved_back = _map_filters(lambda step, later: step.back(later), steps_after, later)
             ends = _map_filters(lambda step: step.end, steps)
-            later = jax.tree.map(lambda end, back: jnp.where(i == 0, end, back), ends, passed)
+            later = jax.tree.map(lambda end, back: jnp.where(i == 0, end, back), ends, moved_back)
             return find_earlier(history, place), steps, later
 
-        start = last, zeros, _map_filters(lambda step: step.end, zeros)
+        start = last_row, zeros, _map_filters(lambda step: step.end, zeros)
         _, steps, later = jax.lax.fori_loop(0, count + 1, step_back, start)
         return sweep.make_estimates(steps, later)
 
@@ -217,13 +218,13 @@ class RowSmoother:
         kinds = tuple(
             k for k, kind in enumerate(network.kinds) if _can_smooth(_get_filter(network, k, kind.filters[0]))
         )
-        filters = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-        central = {name: filter for name, filter in filters.items() if _can_smooth(filter)}
+        all_central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+        central = {name: filter for name, filter in all_central.items() if _can_smooth(filter)}
         if not kinds and not central:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
             )
-        # The network's filters without its fusions, which have no part in a sweep: they fuse what comes out of it.
+        # The network's filters without its fusions, which have no part in a sweep: they fuse the smoothed estimates.
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(fusion for fusion in AllFilters(network).fusions if self._fuses(fusion, kinds))
         # The sweep as a function of its arrays, compiled when a history's length is known.

@@ -114,7 +114,8 @@ class RowStep:
         instance("network", network, Network, "a Network")
         self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
-        # All filters, apart from the arrays in them, and how their states before the first step stand in a row.
+        # All filters, split into the arrays in them and all else; and how their states before the first step stand in
+        # a row of doubles.
         filters = AllFilters(network, judges=True, tests=True)
         _check_reports(filters)
         start = initial_states(filters)

@@ -191,22 +191,22 @@ def _transmit(
     sensor = condition_on_memories(at(node.sensor, k), link.modes).under(node.inputs, u)
     modes = move_modes(node.sensor, link.modes, key, k, node.modes)
     y = measure(sensor, x, draw_key(key, k, node.checksums, SENSOR))
-    # Output that the last estimate fed back predicts; a sensor with feedback sends what is more.
+    # Output that the last estimate fed back predicts; a sensor with feedback sends the difference from it.
     reference: jax.Array | None = None
     if node.reference_filter is not None and link.feed_back is not None:
         reference = node.reference_filter.predict_reference(link.feed_back, u, k)
     if isinstance(node.reference_filter, FedBackFilter) and reference is not None:
         y = y - reference
     y, z, memory = _send_through_channel(node, link.memory, y, key, k)
-    if node.trigger is None or link.sender is None:
-        return LinkState(memory, link.feed_back, modes=modes), z
+    if node.trigger is None or link.sender is None:  # it always sends
+        return LinkState(memory=memory, feed_back=link.feed_back, modes=modes), z
     # The sender decides, by its own reference or the filter's prediction.
     sender = link.sender
     if node.trigger.reference == "prediction" and reference is not None:
         sender = sender._replace(reference=reference)
     drawn = draw_key(key, k, node.checksums, TRIGGER)
     sender, z = node.trigger.transmit(sender, y, z, drawn, k)
-    return LinkState(memory, link.feed_back, sender, modes), z
+    return LinkState(memory=memory, feed_back=link.feed_back, sender=sender, modes=modes), z
 
 
 def _send_through_channel(
