@@ -46,8 +46,9 @@ def screen_recording(
     kept, refused, said = dict[str, np.ndarray](), dict[str, np.ndarray](), list[str]()
     repeats = dict[str, Repeats]()
     for name, node in network.nodes.items():
-        # Readings beyond limits, codes, and readings that are stuck.
-        kept[name], refused[name], lines = z[name], np.zeros(z[name].shape, dtype=np.int8), list[str]()
+        # Readings beyond limits, codes, and readings that are stuck; none of a node without limits.
+        kept[name], refused[name] = z[name], np.zeros(z[name].shape, dtype=np.int8)
+        lines = list[str]()
         if node.limits is not None:
             screened = node.limits.screen(z[name], before.get(name, Repeats()))
             repeats[name] = screened.repeats

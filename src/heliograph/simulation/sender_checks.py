@@ -49,7 +49,7 @@ def check_trigger(
         )
     if trigger.region == "each" and channel.outputs != len(sensor.outputs):
         raise fail("channel of components that are each sent alone", f"{len(sensor.outputs)} outputs", channel.outputs)
-    # The sender knows the prediction of one filter at most: it runs that too.
+    # The sender runs one filter at most itself, to know its prediction; never one that is fed back.
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("trigger", "no filter that is fed back", "one")
     if trigger.reference == "prediction" and not any(
@@ -86,7 +86,7 @@ def check_encoder(
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("encoder", "no filter that is fed back", "one")
     find_places(channel)  # raises where words are amplified
-    # A trigger that compares values compares words, which both ends must share.
+    # A trigger that compares values compares words, which both ends must share. A periodic one compares nothing.
     if trigger is not None and not isinstance(trigger, Periodic):
         if encoder.subtracts:
             raise fail("trigger of a node with an encoder", "a dither that is not taken off, or Periodic", "subtracted")

@@ -310,9 +310,9 @@ def finish_result(
     # Without smoothing the result of the network alone.
     if smoothing is None:
         return reducer.finish(reducer.summed(sums, common, count), collected, network)
-    # As `reduce_run` has them: sums are of filtered estimates, of smoothed ones, and of the NIS.
-    *_, nis_sums_by_batch = sums.sums
-    *_, is_common = common.sums
+    # Sums are three, as `reduce_run` has them: of filtered estimates, of smoothed ones, and of the NIS.
+    _, _, nis_sums_by_batch = sums.sums
+    _, _, is_common = common.sums
     # Summed over all runs: what all runs share counts once for each.
     nis = jax.tree.map(
         lambda leaf, is_same: leaf * count.sum() if is_same else leaf.sum(axis=-1), nis_sums_by_batch, is_common

@@ -198,7 +198,7 @@ def build_centre_filter(
     names = network.nodes_with(fusion.filter)
     complete = {node: network.nodes[node].complete for node in names}
     claim = find_claim_of_report_fusion(type(fusion.rule).__name__, network.claims()[FUSED][name], fusion, complete)
-    # The nodes with that filter alone, for the moments of its errors.
+    # A network of the nodes with that filter alone, and a fusion that has the moments of its errors computed.
     alone = Network(
         network.plant,
         {node: _keep_one_filter(network.nodes[node], fusion.filter) for node in network.names},
@@ -295,9 +295,9 @@ def _build_centre(
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     size = max(network.nodes[node].received for node in nodes)
     claim = claims[next(iter(rules))]  # the same of all rules on one filter
-    # Gains that depend on data: moments along the estimates.
+    # Where gains depend on data, the moments of the errors are followed along the estimates.
     if has_data_dependent_gains(network.parts_of(name)):
-        return LinearisedCentre(network.plant, rules, order, sources, size, claim)
+        return LinearisedCentre(plant=network.plant, rules=rules, order=order, sources=sources, size=size, claim=claim)
     return FusionCentre(
         plant=network.plant,
         observation_model=_model_measurements(network, nodes, groups, order, size),

@@ -94,7 +94,7 @@ class LinearisedCentre(Module):
             matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
-            # Moments of the errors; the rule weights the reports by them.
+            # Moments of the errors, by which the rule weights the reports.
             step = _make_shared_step(motion, keep, linear)
             errors = _keep_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
             # `AllReports` estimates the errors themselves, so that their means matter too.

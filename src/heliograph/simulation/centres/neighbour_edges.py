@@ -101,12 +101,12 @@ class MeshEdges(Module):
             channel = at(edge.channel, k)
             state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
                                       edge.checksums, edge.memories)  # fmt: skip
-            arrives, late = ~jnp.any(jnp.isnan(z)), find_delay(channel)
-            if not self.past:
+            arrives, delay = ~jnp.any(jnp.isnan(z)), find_delay(channel)
+            if not self.past:  # no message is ever late: a flag says all
                 return state, arrives
             age: jax.Array | int = 0
-            if late is not None:
-                age = z[-1].astype(int) if late.timestamped else late.times[0]
+            if delay is not None:
+                age = z[-1].astype(int) if delay.timestamped else delay.times[0]
             # Nothing was sent before the first step.
             return state, jnp.where(arrives & (age <= count), age, -1)
 

@@ -153,10 +153,10 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
     mesh = _build_row(network, fusion, node)
-    # The measurement: the node's own, then a message of each neighbour.
+    # What the filter receives: the node's own measurement, then a message of each neighbour.
     sizes = tuple(network.nodes[name].received for name in mesh.nodes)
     own, *of_neighbours = sizes
-    alone = NodeFilter(
+    filter = NodeFilter(
         mesh=mesh,
         measured=sizes,
         quantizer=next(iter(between.quantizers((node,))), None),
@@ -167,13 +167,13 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         received=own + sum(_count_numbers(len(network.states), size) for size in of_neighbours),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
-    return on_premise(alone, find_premise(network, node))
+    return on_premise(filter, find_premise(network, node))
 
 
 def _build_row(network: Network, fusion: str, node: str) -> Mesh:
     """Return the part of a fusion between neighbours that estimates at one node, from itself and its neighbours.
 
-    All messages arrive in it; what does not is NaN. `fusion` and `node`: names.
+    To it every message arrives; one that did not is a message of NaN. `fusion` and `node`: names.
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     neighbours = between.neighbours or {}
@@ -182,7 +182,7 @@ def _build_row(network: Network, fusion: str, node: str) -> Mesh:
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, senders=graph.senders[i : i + 1, :count], present=np.ones((1, count), dtype=bool))
     names = (node, *neighbours[node])
-    # One group for each of them, since their models may differ.
+    # A model of its own for each of them, since they may differ in structure; None without a sensor.
     members = [network.nodes[name] for name in names]
     models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in members]
     sizes = [n.received for n in members]

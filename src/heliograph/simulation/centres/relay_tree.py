@@ -105,15 +105,16 @@ def relay_tree(
     function("node", node, "the numbers of one leaf that returns a Node")
     count, steps = _count_leaves(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
-        # One leaf stands for the structure of all.
+        # One leaf stands for the structure of all: a network of it is checked as one of all leaves would be.
         leaf = instance("leaf", node(_slice(numbers, 0)), Node, "a Node")
         if len(leaf.filters) != 1:
             raise fail("leaf", "a Node with one filter", f"{len(leaf.filters)} filters")
         (name,) = leaf.filters
-        alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
-        alone.check_horizon(steps)
-        u = read_plant_inputs(alone, inputs, steps)
-        # Leaves in blocks, whole relays each: covariances, weights, and the relays above.
+        one_leaf = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
+        one_leaf.check_horizon(steps)
+        u = read_plant_inputs(one_leaf, inputs, steps)
+        # Leaves in blocks of about BLOCK, each of them all leaves of some relays; of each block the covariances, the
+        # weights, and the errors of the relays above.
         width = degree * max(BLOCK // degree, 1)
         blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
         outputs = [to_numpy(_propagate_block(_Leaves(plant, name, node, degree), block, u)) for block in blocks]
@@ -128,7 +129,7 @@ def relay_tree(
         level_covariances.append(np.asarray(errors.covariances()))
     return RelayTree(
         degree=degree,
-        claim=alone.claims()[FUSED]["all"],
+        claim=one_leaf.claims()[FUSED]["all"],
         covariances=tuple(level_covariances),
         weights=tuple(level_weights),
     )
@@ -183,7 +184,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     count = len(jax.tree.leaves(numbers)[0])
     channels = eqx.filter_vmap(lambda values: describe_channel(leaves.node(values).channel))(numbers)
     filters = nodes.filters[leaves.filter]
-    alike = StackedFilters(filters=filters, group=0, count=1, nodes=count)
+    stacked = StackedFilters(filters=filters, group=0, count=1, nodes=count)
     centre = FusionCentre(
         plant=leaves.plant,
         observation_model=SeparateObservations(
@@ -195,17 +196,18 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
         size=filters.received,
         claim="exact",
     )
-    # Errors by their sources, over the horizon; covariances depend on no measurement, so that zeros do.
+    # Errors by their sources, over the horizon. Covariances depend on no measurement: the filters are stepped with
+    # measurements of zero.
     zeros = jnp.zeros((count, filters.received))
-    states = alike.init()
+    states = stacked.init()
     n = len(first(leaves.plant).states)
     factors_before = make_initial_factors(centre.init([gaussian_of(states).mean]).errors, n * len(u))
     factors = centre.propagate_error_factors(
         (states, factors_before),
-        compute_matrices=lambda before, u_k, k: alike.compute_by_node(
+        compute_matrices=lambda before, u_k, k: stacked.compute_by_node(
             centre.compute_matrices, before, 0, zeros, u_k, k
         ),
-        step_filters=lambda before, u_k, k: alike.step(before, zeros, u_k, k)[0],
+        step_filters=lambda before, u_k, k: stacked.step(before, zeros, u_k, k)[0],
         u=u,
     )
     return factors.errors

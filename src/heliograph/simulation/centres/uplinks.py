@@ -152,7 +152,7 @@ class Uplinks(Module):
         if reports is None or set(reports) != set(nodes):
             got = "none" if reports is None else list(reports)
             raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", got)
-        # The recorded values are offsets of links without gain.
+        # The recorded values enter as offsets of links without gain.
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
             sent, size = reports[node], self.received[i]

@@ -186,7 +186,8 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
     link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
     plant, sensor = filter.plant, filter.sensor
     # A bias of the outputs that the link carries: one more state of the plant for each.
-    if len(logs) > declared.classes:
+    has_bias = len(logs) > declared.classes
+    if has_bias:
         assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
         rate, time = numbers[declared.classes :]
         dt = TIME_STEP if TIME_STEP in plant.inputs else 1.0

@@ -105,18 +105,18 @@ def _find_unobservable(network: Network) -> Iterator[Doubt]:
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
-    # Rows and then columns scaled to length 1, so that no unit matters; rows of zeros stay.
-    lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
-    rows = matrix / np.where(lengths > 0, lengths, 1.0)
-    lengths = np.linalg.norm(rows, axis=0)
-    _, singular, right = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
+    # Rows and then columns scaled to length 1, so that no unit matters; those of zeros stay.
+    row_lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
+    rows = matrix / np.where(row_lengths > 0, row_lengths, 1.0)
+    column_lengths = np.linalg.norm(rows, axis=0)
+    _, singular, right = np.linalg.svd(rows / np.where(column_lengths > 0, column_lengths, 1.0))
     # States with a part in the null space, whose basis are the last right singular vectors.
     rank = int(np.sum(singular > HIDDEN * max(singular[0], 1e-300)))
     hidden = np.abs(right[rank:]).max(axis=0, initial=0.0) > np.sqrt(HIDDEN)
     names = [repr(name) for name, unseen in zip(network.states, hidden, strict=True) if unseen]
     if names:
-        count = len(network.states) - rank
-        what = names[0] if len(names) == 1 else f"{count} of the combinations of {', '.join(names)}"
+        directions = len(network.states) - rank
+        what = names[0] if len(names) == 1 else f"{directions} of the combinations of {', '.join(names)}"
         yield Doubt(True, f"unobservable: no sensor shows {what}, of which filters know no more than before any data")
 
 

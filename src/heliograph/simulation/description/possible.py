@@ -63,6 +63,7 @@ def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
             continue
         estimate = record.estimates[node][label]
         means, covariances = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+        # Judged are the last row and the one LAST rows before it, where estimates have to be numbers.
         if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
             continue
         view = _FilterView(plant, [first(sensor) for sensor in sensors], isinstance(transform, Linearization))

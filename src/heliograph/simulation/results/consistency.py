@@ -178,17 +178,17 @@ def consistency(
     if not present.any():
         raise fail("values", "at least one that is not NaN", f"shape {entries.shape}")
     # Means and intervals: of all values, and of each step over the runs.
-    total = np.where(present, rows, 0.0)
+    filled = np.where(present, rows, 0.0)  # missing values add nothing to the sums
     count = present.sum(axis=0)  # by step
-    by_step = np.divide(total.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
+    by_step = np.divide(filled.sum(axis=0), count, out=np.full(len(count), np.nan), where=count > 0)
     quantiles = np.array([(1 - level) / 2, (1 + level) / 2])
     ends = _bound_mean(degrees.sum(), present.sum(), quantiles)
     ends_by_step = np.stack([_bound_mean(d, c, quantiles) for d, c in zip(degrees.sum(axis=0), count, strict=True)])
     # Correlation over the steps of deviations from the mean of all.
-    deviations = np.where(present, rows - total.sum() / present.sum(), 0.0)
+    deviations = np.where(present, rows - filled.sum() / present.sum(), 0.0)
     correlation = _autocorrelation(deviations, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
-        mean=float(total.sum() / present.sum()),
+        mean=float(filled.sum() / present.sum()),
         expected=float(degrees.sum() / present.sum()),
         interval=(float(ends[0]), float(ends[1])),
         means=by_step,

@@ -118,11 +118,12 @@ def draw_modes(
     }
     node, chosen = choose_filters(weighing, node, filters)
     time, units = clock
-    (panel,), styles = make_panels(None if axes is None else [axes], 1, time, units), ("-", "--", ":", "-.")
+    (panel,) = make_panels(None if axes is None else [axes], 1, time, units)
+    line_styles = "-", "--", ":", "-."
     for number, name in enumerate(chosen):
         modes = np.asarray(weighing[node][name].modes)[... if run is None else run]
         for j in range(modes.shape[-1]):
-            panel.plot(time, modes[:, j], styles[j % len(styles)], color=choose_colour(number),
+            panel.plot(time, modes[:, j], line_styles[j % len(line_styles)], color=choose_colour(number),
                        label=quote_for_figure(f"{name}, mode {j}"))  # fmt: skip
     panel.set_ylim(-0.02, 1.02)
     panel.set_ylabel("probability")

@@ -334,7 +334,7 @@ class Record(Saved):
         node, filters = choose_filters(self.estimates, node, filters)
         places = find_state_places(states, self.states)
         check_run(run, self.runs)
-        of_run: Any = ... if self.runs is None else run  # index of the run; all of a record without runs
+        of_run: Any = ... if self.runs is None else run  # index of the run; `...` takes all of a record without runs
         drawn = make_panels(axes, len(places), self.time, self.units)
         for panel, i in zip(drawn, places, strict=True):
             draw_state(panel, self.time, {name: self.estimates[node][name] for name in filters}, (of_run, i), sigmas)

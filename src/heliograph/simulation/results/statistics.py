@@ -162,8 +162,8 @@ class ErrorStatistics:
             covariance: sums of claimed covariances (batch, time, n, n).
         """
         # Step and direction of the largest ratio in the batches that choose.
-        chosen = ~held_out & (self.count > 0)
-        actual, claimed = outer[chosen].sum(axis=0), covariance[chosen].sum(axis=0)
+        choosing = ~held_out & (self.count > 0)
+        actual, claimed = outer[choosing].sum(axis=0), covariance[choosing].sum(axis=0)
         values, directions = _solve_generalised_eigen(actual, claimed)
         step = int(np.argmax(values[:, -1]))
         d = directions[step, :, -1]

@@ -46,6 +46,7 @@ def make_frame(fields: Mapping[str, Any], runs: int | None) -> "pd.DataFrame":
     index = pd.Index(fields["time"], name="time")
     if runs is not None:
         index = pd.MultiIndex.from_product([range(runs), index], names=["run", "time"])
+    # Columns are numbered at first, since pandas would convert some labels to numbers or to missing values.
     frame = pd.DataFrame({i: values.reshape(-1) for i, values in enumerate(columns.values())}, index=index)
     frame.columns = _keep_labels(list(columns))
     return frame
@@ -62,11 +63,11 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
     # Places of the columns, and values (run, time, component), by (node, filter, quantity).
     runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
     steps = len(frame) // (runs or 1)
-    lead = (steps,) if runs is None else (runs, steps)
+    leading_axes = (steps,) if runs is None else (runs, steps)
     places: _Places = {}
     for i, (node, name, quantity, _, _) in enumerate(frame.columns):
         places.setdefault((node, name, quantity), []).append(i)
-    values = {key: frame.iloc[:, columns].to_numpy().reshape(*lead, -1) for key, columns in places.items()}
+    values = {key: frame.iloc[:, columns].to_numpy().reshape(*leading_axes, -1) for key, columns in places.items()}
     # States as the truth, else the first mean, has them.
     named = next((columns for (_, _, quantity), columns in places.items() if quantity in ("truth", "mean")), [])
     measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}

@@ -69,7 +69,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
     sensor, channel = stack(pairs)
     seeds = [_split_seeds((node.sensor, node.channel), memories_of[name]) for name, node in nodes.items()]
     sensor_seeds, channel_seeds = (np.stack(parts) for parts in zip(*seeds, strict=True))
-    # What a sender that decides knows: its filter, its rule.
+    # What the sender knows of the receiver: the filter that is fed back to it, or whose prediction it compares with.
     filter_name: str | None = first_node.informed_by or first_node.predictor
     reference: PyTree = None
     if filter_name is not None:

@@ -97,18 +97,18 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """
     listed, memories = list(channels.values()), list(number_memories(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
-    # Rows of each structure's channels by their identity: one object under many names is stacked once.
-    unnamed = {key: drop_names(channel) for key, channel in {id(c): c for c in listed}.items()}
+    # Rows of each structure's channels, by the objects' identities: one object under many names is stacked once.
+    unnamed = {identity: drop_names(channel) for identity, channel in {id(c): c for c in listed}.items()}
     rows_by_structure: dict[object, dict[int, int]] = {}
-    for key, channel in unnamed.items():
+    for identity, channel in unnamed.items():
         row_of = rows_by_structure.setdefault(structure(channel), {})
-        row_of[key] = len(row_of)
+        row_of[identity] = len(row_of)
     # A group for each structure: its channels stacked, then one row for each name that has one of them.
     groups = []
     for row_of in rows_by_structure.values():
         places = np.array([i for i, channel in enumerate(listed) if id(channel) in row_of])
         rows = np.array([row_of[id(listed[i])] for i in places])
-        stacked = stack([unnamed[key] for key in row_of])
+        stacked = stack([unnamed[identity] for identity in row_of])
         channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, stacked)
         groups.append(
             ChannelGroup(
