@@ -28,7 +28,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
     for reader in _find_flag_filters(filter):
         if isinstance(reader, ModeObservedFilter):
             sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
-            wrong = [row for row in rows[sent : reader.received] if not _reveals(row, reader.late)]
+            wrong = [row for row in rows[sent : reader.received] if not _reveals_mode(row, reader.late)]
         else:
             expected = "hg.model.with_flag(link, flags)"
             wrong = [row for row in rows[reader.received - 1 : reader.received] if isinstance(row, OneStepLate)]
@@ -53,7 +53,7 @@ def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | M
     ]
 
 
-def _reveals(affine: AbstractRandomAffine, late: bool) -> bool:
+def _reveals_mode(affine: AbstractRandomAffine, late: bool) -> bool:
     """Return whether a map delivers a mode: that of the step before if `late`, else that of this step."""
     if late:
         return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)

@@ -42,7 +42,7 @@ def read_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[s
 
 
 # Traced once, for the shapes of its results and for the loop's body: tracing is most of what a step takes to compile.
-_step: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
+_step_filters: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
 
 
 def step_plausibly(
@@ -72,7 +72,7 @@ def step_plausibly(
     # The loop begins with outputs of zeros, in which nothing is implausible; their shapes are those of a step's.
     by_kind = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.alike]
     none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
-    _, output_shapes = eqx.filter_eval_shape(_step, filters, states, z, u, k, drawn, none_skipped)
+    _, output_shapes = eqx.filter_eval_shape(_step_filters, filters, states, z, u, k, drawn, none_skipped)
 
     def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
         """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
@@ -82,7 +82,7 @@ def step_plausibly(
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
         """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
         turn, (_, before) = carry
-        after, outputs = _step(filters, states, z, u, k, drawn, read_reasons(before))
+        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_reasons(before))
         # The first turn judges all data, the second what is left of them: the first's judgements stay.
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])

@@ -55,7 +55,7 @@ class CrossCovariances:
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Covariance Cov(e_i, e_j) of all pairs of nodes' errors."""
-        return np.asarray(self._sources.joint())
+        return np.asarray(self._error_sources.joint())
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -72,12 +72,12 @@ class CrossCovariances:
 
         The time that it takes is linear in the number of nodes where P allows it.
         """
-        weights = _choose_weights(self._sources)
-        shared, independent = self._sources.weigh(weights)
+        weights = _choose_weights(self._error_sources)
+        shared, independent = self._error_sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
 
     @property
-    def _sources(self) -> ErrorSources:
+    def _error_sources(self) -> ErrorSources:
         """The errors by their sources: the shared part, and the covariance of the independent part."""
         return ErrorSources(self.shared, self.independent)
 

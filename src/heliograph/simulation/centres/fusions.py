@@ -84,8 +84,8 @@ class StackedFusions(Module):
             components "saturated" a quantizer and how many "symbols" it sent, (node, n).
         """
         # Means and covariances in the order of each fusion's nodes.
-        means = self._gather([e.mean for e in estimates])
-        covariances = self._gather([e.covariance for e in estimates])
+        means = self._gather_by_fusion([e.mean for e in estimates])
+        covariances = self._gather_by_fusion([e.covariance for e in estimates])
         uplinks: dict[str, PyTree] = {}
         # Quantized means, and covariances widened by the quantizers' errors.
         if self.quantizers is not None:
@@ -107,7 +107,7 @@ class StackedFusions(Module):
         }
         return states, fused, uplinks
 
-    def _gather(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+    def _gather_by_fusion(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters, (filter, node, ...) by kind, as (fusion, node, ...) in each fusion's order."""
         joined = [jnp.concatenate([parts[kind][f] for kind, f in source]) for source in self.sources]
         # In order already: no gather is compiled.

@@ -106,7 +106,7 @@ def relay_tree(
     count, steps = _count_leaves(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
         # One leaf stands for the structure of all: a network of it is checked as one of all leaves would be.
-        leaf = instance("leaf", node(_slice(numbers, 0)), Node, "a Node")
+        leaf = instance("leaf", node(_take_rows(numbers, 0)), Node, "a Node")
         if len(leaf.filters) != 1:
             raise fail("leaf", "a Node with one filter", f"{len(leaf.filters)} filters")
         (name,) = leaf.filters
@@ -116,7 +116,7 @@ def relay_tree(
         # Leaves in blocks of about BLOCK, each of them all leaves of some relays; of each block the covariances, the
         # weights, and the errors of the relays above.
         width = degree * max(BLOCK // degree, 1)
-        blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
+        blocks = [_take_rows(numbers, slice(i, i + width)) for i in range(0, count, width)]
         outputs = [to_numpy(_propagate_block(_Leaves(plant, name, node, degree), block, u)) for block in blocks]
         covariances, weights, relays = (list(leaves) for leaves in zip(*outputs, strict=True))
         # The relays' errors, level by level up to the root.
@@ -168,9 +168,11 @@ def _propagate_block(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> tuple[A
     # Full relays at once, then the last one if it has fewer children.
     count, degree = len(errors.independent), leaves.degree
     full = count - count % degree
-    weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), errors))
+    weights, above = jax.vmap(_weigh_children)(
+        jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), errors)
+    )
     if count > full:
-        last_weights, last_error = _fuse(jax.tree.map(lambda a: a[full:], errors))
+        last_weights, last_error = _weigh_children(jax.tree.map(lambda a: a[full:], errors))
         last_weights = jnp.pad(last_weights, ((0, 0), (0, degree - last_weights.shape[1]), (0, 0)))
         weights = jnp.concatenate([weights, last_weights[None]])
         above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, last_error)
@@ -215,7 +217,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
 
 def _climb_level(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
     """Return the weights (relay, n, child, n) and the errors of the relays above nodes with these errors."""
-    groups = [_slice(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
+    groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
     weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
     return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *(error for _, error in outputs))
@@ -223,11 +225,11 @@ def _climb_level(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSo
 
 @quickly_compiled
 def _fuse_at_relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the weights of a relay for its children, and the error of its estimate: `_fuse`, compiled."""
-    return _fuse(children)
+    """Return the weights of a relay for its children, and the error of its estimate: `_weigh_children`, compiled."""
+    return _weigh_children(children)
 
 
-def _fuse(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
+def _weigh_children(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
     """Return the best weights (n, child, n) of children with these errors, and the error of their weighted estimate."""
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
@@ -244,7 +246,7 @@ def _pad_to_degree(weights: np.ndarray, degree: int) -> np.ndarray:
     return np.pad(weights, ((0, 0), (0, degree - weights.shape[1]), (0, 0)))
 
 
-def _slice(numbers: PyTree, rows: int | slice) -> PyTree:
+def _take_rows(numbers: PyTree, rows: int | slice) -> PyTree:
     """Return these rows of every array: of some leaves, or of one without the leading axis."""
     return jax.tree.map(lambda leaf: leaf[rows], numbers)
 

@@ -74,11 +74,11 @@ def examine_innovations(
             _, error = average_correlated(np.nanmean(squares, axis=1))
             low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
         nis.append(NisOfClass(mean, float(low), float(high)))
-    correlation, p_value = _correlate(white[classes >= 0], filter.knows_gain)
+    correlation, p_value = _test_correlation(white[classes >= 0], filter.knows_gain)
     return InnovationTests(nis, correlation, p_value)
 
 
-def _correlate(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
+def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
     """Return the correlation over one message, and the p-value of those over up to ten; `exact`: claimed independent.
 
     r_l = sum_k u_k u_k-l / sum_k u_k^2. Independent: Ljung and Box's sum is chi-squared; else each r_l has its error.

@@ -368,12 +368,12 @@ def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
         bounded = bias.times_white < 2 * bias.times_white_low
-        times = f"{_rounded(bias.times_white)}" if bounded else f"at least {_rounded(bias.times_white_low)}"
+        times = f"{_two_digits(bias.times_white)}" if bounded else f"at least {_two_digits(bias.times_white_low)}"
         lines.append(f"the declared deviation is {times} times the white part of the error")
-    ends = f"{_rounded(bias.time_low)} to {_rounded(bias.time_high)}" if np.isfinite(bias.time_high) else (
-        f"at least {_rounded(bias.time_low)}")  # fmt: skip
+    ends = f"{_two_digits(bias.time_low)} to {_two_digits(bias.time_high)}" if np.isfinite(bias.time_high) else (
+        f"at least {_two_digits(bias.time_low)}")  # fmt: skip
     lines.append(
-        f"the error has a memory of about {_rounded(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
+        f"the error has a memory of about {_two_digits(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
     )
     return lines
 
@@ -387,10 +387,10 @@ def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
     if one.scale < 1:
         times, low, high, kind = 1 / one.scale, 1 / one.scale_high, 1 / one.scale_low, "large"
     of = f" from {one.low:.3g} to {one.high:.3g}" if several else ""
-    factor = f"{_rounded(times)} times too {kind} ({_rounded(low)} to {_rounded(high)})"
+    factor = f"{_two_digits(times)} times too {kind} ({_two_digits(low)} to {_two_digits(high)})"
     return [f"declared variances{of} are {factor}; scaled so, the innovations pass"]
 
 
-def _rounded(value: float) -> str:
+def _two_digits(value: float) -> str:
     """Return a number, rounded to two digits, as text."""
     return f"{float(f'{value:.2g}'):,.15g}"

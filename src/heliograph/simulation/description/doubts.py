@@ -241,12 +241,12 @@ def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
         except InputError:  # a memory that nothing is known of
             continue
         for label, filter_ in node.filters.items() if remembers else ():
-            if _forgets(filter_):
+            if _ignores_memory(filter_):
                 nodes.setdefault(label, []).append(name)
     return nodes
 
 
-def _forgets(filter: AbstractFilter) -> bool:
+def _ignores_memory(filter: AbstractFilter) -> bool:
     """Return whether a filter, or the one that it wraps, has no model of memory."""
     inner = getattr(filter, "base", filter)
     return isinstance(inner, GaussianFilter | LinearFilter)

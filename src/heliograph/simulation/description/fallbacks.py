@@ -21,13 +21,13 @@ def list_fallbacks(network: Network) -> list[str]:
     by_reason: dict[str, list[str]] = {}
     for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
         by_reason.setdefault(why, []).append(who)
-    return [f"{_join(refused)}: {why}" for why, refused in by_reason.items()]
+    return [f"{_join_first_names(refused)}: {why}" for why, refused in by_reason.items()]
 
 
 def list_sequential(network: Network) -> str:
     """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
     sequential = [who for who, filter in _list_filters(network) if not filter.is_linear]
-    return _join(sequential) if sequential else ""
+    return _join_first_names(sequential) if sequential else ""
 
 
 def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
@@ -43,11 +43,11 @@ def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
     for who, named in _list_filters(network):
         filter = without_output_names(named)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
-        if why := explain_refusal(_step, filter, filter.init(), z, u, np.asarray(0)):
+        if why := explain_refusal(_step_filter, filter, filter.init(), z, u, np.asarray(0)):
             yield who, why
 
 
-def _step(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
+def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
     """Return what one step of a filter returns for (state, z, u, k), as it would be compiled."""
     state, z, u, k = arguments
     return filter.step(state, z, u, k)
@@ -61,7 +61,7 @@ def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
 
 
-def _join(names: list[str]) -> str:
+def _join_first_names(names: list[str]) -> str:
     """Return names in words, the first SHOWN of many and how many more there are."""
     more = len(names) - SHOWN
     return f"{', '.join(names[:SHOWN])} and {more} more" if more > 0 else join_names(names)

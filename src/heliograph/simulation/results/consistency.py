@@ -186,7 +186,7 @@ def consistency(
     ends_by_step = np.stack([_bound_mean(d, c, quantiles) for d, c in zip(degrees.sum(axis=0), count, strict=True)])
     # Correlation over the steps of deviations from the mean of all.
     deviations = np.where(present, rows - filled.sum() / present.sum(), 0.0)
-    correlation = _autocorrelation(deviations, min(check_count("lags", lags), len(count) - 1))
+    correlation = _correlate_over_steps(deviations, min(check_count("lags", lags), len(count) - 1))
     return Consistency(
         mean=float(filled.sum() / present.sum()),
         expected=float(degrees.sum() / present.sum()),
@@ -220,7 +220,7 @@ def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
-def _autocorrelation(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
+def _correlate_over_steps(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
     """Return the correlation over 1, 2, ... steps of deviations from their mean; a missing one is given as zero."""
     power = np.sum(apart**2)
     sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]

@@ -146,7 +146,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
             for node, filters in self.items():
                 for name, score in filters.items():
                     index.append((node, name))
-                    rows.append(_summarise(score, self.states))
+                    rows.append(_list_figures(score, self.states))
         names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
         return pd.DataFrame(rows, index=names)
 
@@ -207,7 +207,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         return lines
 
 
-def _summarise(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+def _list_figures(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
     """Return a filter's figures by name: RMSE, NEES with its interval, and RMSE and claim of each state."""
     nees, low, high = score.nees_per_dimension()
     rmse, error = score.rmse()

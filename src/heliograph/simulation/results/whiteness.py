@@ -125,11 +125,11 @@ def memory_test(
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
-    white = _standardise(data) if filter is None else whitened_innovations(data, filter, inputs)
+    white = _scale_to_unit_power(data) if filter is None else whitened_innovations(data, filter, inputs)
     return MemoryTest.of(white, lags, claimed=filter is not None)
 
 
-def _standardise(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
+def _scale_to_unit_power(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Return innovations (steps, m) of unknown covariance, each component in units of its own root mean square."""
     values = array("innovations", data, (None,) * max(rank("innovations", data), 1), missing=True)
     value = values[:, None] if values.ndim == 1 else values

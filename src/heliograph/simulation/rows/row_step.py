@@ -146,7 +146,7 @@ class RowStep:
         return self._code is not None
 
     @property
-    def _block(self) -> tuple[int, int]:
+    def _rows_of_call_and_turn(self) -> tuple[int, int]:
         """Return how many rows a call of XLA's program takes, and how many one turn of its loop.
 
         The layout alone decides, so that a result depends on no number of rows.
@@ -172,7 +172,7 @@ class RowStep:
     @cached_property
     def program(self) -> str:
         """Return the step as text, which two processes compare to see that they compute the same."""
-        return _text(self._layout, self._shapes)
+        return _write_step_text(self._layout, self._shapes)
 
     def history(
         self,
@@ -206,8 +206,8 @@ class RowStep:
             stepped: np.ndarray = self._code(rows)
             return stepped
         # Blocks of rows, the last filled up; of its turns no more run than have rows.
-        width, together = (1, 1) if alone else self._block
-        run = _compile_xla(self._layout, self.outputs, width, together, is_long=self._block[1] == 1)
+        width, together = (1, 1) if alone else self._rows_of_call_and_turn
+        run = _compile_xla(self._layout, self.outputs, width, together, is_long=self._rows_of_call_and_turn[1] == 1)
         done, filled = np.empty((len(rows), self.state.size + self.outputs.size)), np.zeros((width, rows.shape[1]))
         for begin in range(0, len(rows), width):
             count = min(width, len(rows) - begin)
@@ -288,7 +288,7 @@ def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) ->
 
 
 @lru_cache(TEXTS)
-def _text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
+def _write_step_text(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> str:
     """Return the step as text, once for networks that differ in numbers alone."""
     return write_program_text(_trace_step(layout, numbers).jaxpr)
 

@@ -44,8 +44,8 @@ def simulate_trajectories(
     )
     output_varies = _mark_dependent_results(body, [*state_varies, True, *row_varies])[count:]
     # The step for all runs: an axis of runs only where values differ. The arguments are state, key and row.
-    in_axes = [*_axes(state_varies), 0, *_axes(row_varies)]
-    advance = jax.vmap(jaxpr_as_fun(body), in_axes=in_axes, out_axes=_axes([*state_varies, *output_varies]))
+    in_axes = [*_list_run_axes(state_varies), 0, *_list_run_axes(row_varies)]
+    advance = jax.vmap(jaxpr_as_fun(body), in_axes=in_axes, out_axes=_list_run_axes([*state_varies, *output_varies]))
 
     def step_all(state: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
         """Step all runs: return the leaves of their next states, and those of their outputs."""
@@ -79,7 +79,8 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
         _, is_needed = dce_jaxpr(traced.jaxpr, [i == j for j in results])
         result_varies.append(any(differs and needed for differs, needed in zip(varies, is_needed, strict=True)))
     # The axis of runs last inside, first outside.
-    apply = jax.vmap(jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(result_varies), axis_size=runs)
+    in_axes, out_axes = _list_run_axes(varies), _list_run_axes(result_varies)
+    apply = jax.vmap(jaxpr_as_fun(traced), in_axes=in_axes, out_axes=out_axes, axis_size=runs)
     arguments = [
         jnp.moveaxis(leaf, 0, -1) if differs else leaf[0] for leaf, differs in zip(leaves, varies, strict=True)
     ]
@@ -102,7 +103,7 @@ def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[l
     """
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _mark_dependent_results(traced, [True])
-    start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)
+    start = jax.vmap(jaxpr_as_fun(traced), out_axes=_list_run_axes(varies))(keys)
     return start, varies, jax.tree.structure(shape)
 
 
@@ -138,6 +139,6 @@ def _put_runs_first(leaves: Sequence[jax.Array], varies: Sequence[bool]) -> list
     return [jnp.moveaxis(leaf, -1, 0) if differs else leaf[None] for leaf, differs in zip(leaves, varies, strict=True)]
 
 
-def _axes(varies: Sequence[bool]) -> list[int | None]:
+def _list_run_axes(varies: Sequence[bool]) -> list[int | None]:
     """Return the axis of runs for `jax.vmap`: the last of what varies, none of the rest."""
     return [-1 if v else None for v in varies]

@@ -46,7 +46,7 @@ def _find_default_folder() -> Path:
     try:
         return Path.home() / ".cache" / "heliograph" / "compilations"
     except RuntimeError:
-        raise _fail("folder for compiled programs", "one, or a home folder to make it in", "neither") from None
+        raise _make_error("folder for compiled programs", "one, or a home folder to make it in", "neither") from None
 
 
 def _make_private(path: Path) -> None:
@@ -59,12 +59,12 @@ def _make_private(path: Path) -> None:
             path.chmod(PRIVATE)  # as an earlier release made it
             status = path.stat()
     except OSError as error:
-        raise _fail(f"folder {path}", "one that can be made", error.strerror) from None
+        raise _make_error(f"folder {path}", "one that can be made", error.strerror) from None
     if hasattr(os, "getuid") and status.st_uid not in (os.getuid(), 0):
-        raise _fail(f"folder {path}", "the user's own", f"that of user {status.st_uid}")
+        raise _make_error(f"folder {path}", "the user's own", f"that of user {status.st_uid}")
 
 
-def _fail(name: str, expected: str, got: object) -> ValueError:
+def _make_error(name: str, expected: str, got: object) -> ValueError:
     """Return the error that the library's `fail` makes, importing it only now."""
     from heliograph.numerics.check import fail  # it loads NumPy and JAX, for which --help need not wait
 

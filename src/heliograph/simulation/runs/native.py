@@ -61,7 +61,7 @@ def compile_runs(
     """
     key_words = _read_key(key)
     # One program for networks of one structure: arrays are its arguments.
-    (of_world, arrays), (of_rest, others) = _describe_world(world), _describe((later, inputs, reducer))
+    (of_world, arrays), (of_rest, others) = _split_world(world), _split_arrays((later, inputs, reducer))
     try:
         compiled = _find_program(of_world, of_rest, bool(jax.threefry_partitionable.value), precision)
     except TypeError as error:  # structures are keys of a cache
@@ -179,7 +179,7 @@ class _Structure(NamedTuple):
         return jax.tree.unflatten(self.tree, leaves)
 
 
-def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
+def _split_arrays(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
     """Return a tree's structure and its arrays, of which `_Structure.restore` makes the tree again."""
     leaves, structure = jax.tree.flatten(tree)
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
@@ -189,9 +189,9 @@ def _describe(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 
 
 @cache_by_object
-def _describe_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
+def _split_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
     """Return a world's structure and its arrays, once for all simulations of it."""
-    return _describe(world)
+    return _split_arrays(world)
 
 
 @lru_cache(PROGRAMS)
