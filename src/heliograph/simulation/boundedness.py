@@ -269,10 +269,9 @@ class KnownGainSums(NamedTuple):
         mean_signal = np.append(links.sensor_mean, 1.0)
         signal = np.outer(mean_signal, mean_signal)  # E[y y']
         signal[:-1, :-1] += links.sensor_noise
-        about = self.mean @ mean_signal
-        center = mean @ mean_signal
-        total = np.einsum("ijab,ab->ij", second, signal) - np.outer(center, about) - np.outer(about, center)
-        return np.asarray(self.combine @ (total + np.outer(about, about)) @ self.combine.T)
+        about, center = self.mean @ mean_signal, mean @ mean_signal  # M E y, and E[G] E y in this outcome
+        spread = np.einsum("ijab,ab->ij", second, signal) - np.outer(center, about) - np.outer(about, center)
+        return np.asarray(self.combine @ (spread + np.outer(about, about)) @ self.combine.T)
 
 
 def _find_known_sums(

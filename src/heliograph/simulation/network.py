@@ -273,13 +273,14 @@ class Network(Module):
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
         """
-        known, optional = set(names), set() if self.relays is None else set(self.relays.relays)
-        unknown = sorted((known ^ set(self.nodes)) - (optional - known))
-        if unknown:
-            raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {unknown}")
-        if len(known) == len(self.nodes):
+        given, optional = set(names), set() if self.relays is None else set(self.relays.relays)
+        # Names that are given and no node's, or the reverse; relays alone may lack.
+        mismatched = sorted((given ^ set(self.nodes)) - (optional - given))
+        if mismatched:
+            raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {mismatched}")
+        if len(given) == len(self.nodes):
             return self
-        return Network(self.plant, {n: v for n, v in self.nodes.items() if n in known}, relays=self.relays)
+        return Network(self.plant, {n: v for n, v in self.nodes.items() if n in given}, relays=self.relays)
 
     def nodes_with(self, name: str) -> list[str]:
         """Return the names of the nodes that have the filter `name`, in the order of the network.

@@ -187,8 +187,16 @@ def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray,
     }
     if TIME_STEP in network.inputs and len(u) > 1:
         spacing = float(np.median(u[1:, network.inputs.index(TIME_STEP)]))
-    months = usual_months(record.time)
-    return Origin(network, state, len(u), last_input(u), record.time[-1], spacing, last_estimates, months)
+    return Origin(
+        model=network,
+        state=state,
+        step=len(u),
+        inputs=last_input(u),
+        time=record.time[-1],
+        spacing=spacing,
+        estimates=last_estimates,
+        months=usual_months(record.time),
+    )
 
 
 def _find_times(

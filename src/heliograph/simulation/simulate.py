@@ -210,7 +210,7 @@ def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, prog
             first_run,
             one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
         )
-        parts = advance_in_chunks(lanes.advance, lanes.count, lanes.wide, (runs, chunk), progress)
+        parts = advance_in_chunks(lanes.advance, lanes.count, wide=lanes.wide, runs=(runs, chunk), progress=progress)
     collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
     # Sums, and for each whether it is a value that all runs share.
     total = lanes.total()
@@ -256,6 +256,7 @@ def _simulate_all_lanes(job: _SimulationJob, blocks: PyTree, carries: PyTree) ->
 def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
     """Return the sums and the flags of one block of runs, by batch, and what is collected, (run, time, ...)."""
     recorded = _reduce(job.reducer, job.later, _simulate_outputs(job, runs))
+    # The last block may have runs beyond the last one; run r belongs to batch r mod BATCHES.
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     def sum_by_batch(leaf: jax.Array) -> PyTree:

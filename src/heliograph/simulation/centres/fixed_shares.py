@@ -99,7 +99,9 @@ def _compute_growth(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tupl
         # Growth in this step, since before it the trace was 1 (but for the first, which is not used).
         logarithms.append(np.log(np.trace(joint)))
         joint /= np.trace(joint)
-    return float(np.exp(np.mean(logarithms[-LAST:]))), np.einsum("iaia->i", joint.reshape(nodes, n, nodes, n))
+    # In the long run: the geometric mean of the last steps.
+    growth = float(np.exp(np.mean(logarithms[-LAST:])))
+    return growth, np.einsum("iaia->i", joint.reshape(nodes, n, nodes, n))
 
 
 def _take_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:

@@ -343,6 +343,7 @@ def _model_measurements(
         size: length of the longest measurement, to which others are padded.
     """
     if network.common is not None:
+        # Of each node the rows of the common channel's output that it receives, -1 for those that it lacks.
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]
         return SharedObservation(network.common.sensor, describe_channel(network.common.channel), np.array(padded))

@@ -266,6 +266,7 @@ def _hides_modes(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> tuple
     size = np.linalg.norm(a, 2) or 1.0
     hides_unstable = hides_decaying = False
     for value in values:
+        # Of lower rank, so that its smallest singular value is 0, where outputs hide the mode (test of Hautus).
         pencil = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < RANK:
             unstable = abs(value) >= 1 - MODE

@@ -220,7 +220,9 @@ def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPa
             rows.append(i)
             present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
             probability.append(float(np.prod(np.where(flags, of_node, 1 - of_node))))
-    return ArrivalPatterns(np.array(rows), np.array(present), np.array(probability), np.array(start))
+    return ArrivalPatterns(
+        node=np.array(rows), present=np.array(present), probability=np.array(probability), start=np.array(start)
+    )
 
 
 def _get_known_probability(edge: str, link: Channel) -> float:

@@ -117,12 +117,12 @@ class NodeFilter(AbstractSizedFilter):
         Rows of these: the node's own, then its neighbours'. Where no message came, the mean is NaN, and the covariance
         any regular one: the node's own.
         """
-        n, end = len(self.states), self.measured[0]
-        sensed, means, covariances = [z[:end]], [before.mean[0]], [before.covariance[0]]
+        n, begin = len(self.states), self.measured[0]  # where the next neighbour's numbers begin in z
+        sensed, means, covariances = [z[:begin]], [before.mean[0]], [before.covariance[0]]
         # Of each neighbour mean (n), covariance (n n) and measurement (size).
         for size in self.measured[1:]:
-            mean, covariance, measured = jnp.split(z[end : end + n + n * n + size], [n, n + n * n])
-            end += n + n * n + size
+            mean, covariance, measured = jnp.split(z[begin : begin + n + n * n + size], [n, n + n * n])
+            begin += n + n * n + size
             sensed.append(measured)
             arrives = ~jnp.any(jnp.isnan(covariance))
             means.append(jnp.where(arrives, mean, jnp.nan))

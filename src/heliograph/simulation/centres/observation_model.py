@@ -40,9 +40,9 @@ class ObservationModel(Module):
         )
         padding = (0, size - offset.shape[-1])
         return JointObservation(
-            jnp.pad(gain, ((0, 0), padding, (0, 0))),
-            jnp.pad(offset, ((0, 0), padding)),
-            jnp.pad(noise, ((0, 0), padding, padding)),
+            gain=jnp.pad(gain, ((0, 0), padding, (0, 0))),
+            offset=jnp.pad(offset, ((0, 0), padding)),
+            noise=jnp.pad(noise, ((0, 0), padding, padding)),
         )
 
 
@@ -59,7 +59,9 @@ def _linearise_observation(
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
-    return JointObservation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
+    return JointObservation(
+        gain=gain @ c, offset=gain @ sensor.noise.mean + channel.offset, noise=gain @ noise @ gain.T + spread
+    )
 
 
 class SeparateObservations(Module):

@@ -79,9 +79,10 @@ def examine_innovations(
 
 
 def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
-    """Return the correlation over one message, and the p-value of those over up to ten; `exact`: claimed independent.
+    """Return the correlation over one message, and the p-value of those over up to ten.
 
-    r_l = sum_k u_k u_k-l / sum_k u_k^2. Independent: Ljung and Box's sum is chi-squared; else each r_l has its error.
+    r_l = sum_k u_k u_k-l / sum_k u_k^2. `exact`: innovations are independent if their claim is true. Then Ljung and
+    Box's sum of the r_l^2 is chi-squared; else each r_l is taken in units of an error estimated for it.
     """
     rows, count = len(white), int(np.sum(~np.isnan(white)))
     lags = min(LAGS, rows // 10)

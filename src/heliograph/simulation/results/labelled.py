@@ -254,6 +254,7 @@ def iterate_filters(
     fields = {name: read_values(dataset, name, lead) for name in names}
     node_axes = {name: list_axes(name, lead).index("node") for name in names}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
+        # All rows, whose axes stand before that of nodes, of node i and filter j.
         values = {name: field[(*(slice(None),) * node_axes[name], i, j)].copy() for name, field in fields.items()}
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
 

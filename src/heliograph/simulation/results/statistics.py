@@ -125,9 +125,9 @@ class ErrorStatistics:
         self._warn_of_failures()
         n = self.outer.shape[-1]
         mean, error = _average_batches(self.nees.mean(axis=1) / n, self.count)
-        width = (
-            float(scipy.special.stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
-        )
+        # The quantile of Student's t for the batches that have runs, since the error is estimated from their scatter.
+        freedom = max(int(np.count_nonzero(self.count)) - 1, 1)
+        width = float(scipy.special.stdtrit(freedom, (1 + confidence) / 2)) * error
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":

@@ -92,14 +92,15 @@ def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key,
     """
     node, name, quantity = key
     mean, covariance = values[node, name, "mean"], values[key]
-    # The last level of a mean's columns numbers the states of attitudes.
-    order = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
+    # The last level of a mean's columns numbers the states of attitudes, "0", "1" and so on; it is "" of all others.
+    numbers = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
+    of_attitudes = len(numbers) - numbers.count("")
     return Estimate(
-        mean,
-        covariance.reshape(*mean.shape, mean.shape[-1]),
-        COVARIANCE[quantity],
-        values.get((node, name, MODES)),
-        attitude=tuple(order.index(str(i)) for i in range(len(order) - order.count(""))),
+        mean=mean,
+        covariance=covariance.reshape(*mean.shape, mean.shape[-1]),
+        claim=COVARIANCE[quantity],
+        modes=values.get((node, name, MODES)),
+        attitude=tuple(numbers.index(str(i)) for i in range(of_attitudes)),
     )
 
 

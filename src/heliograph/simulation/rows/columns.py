@@ -123,7 +123,9 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
     """Return the columns of each part of a judgement, by node and filter; `outcome` as of `_collect_weights`."""
     judged = {"estimates": outcome["judged"], "fused": {}}
-    parts = [split_by_name(network, judged, partial(_read_field, i), -2) for i in range(len(JudgementColumns._fields))]
+    # Each field of the judgements, of which the axes are the last two, (filter, node).
+    fields = range(len(JudgementColumns._fields))
+    parts = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
     by_node = {
         node: {name: JudgementColumns(*(int(field[node][name]) for field in parts)) for name in filters}
         for node, filters in parts[0].items()

@@ -82,6 +82,7 @@ class BackwardSweep(Module):
         `steps`: smoother steps into it. `later`: each filter's Gaussian of the state given all data, in the same form.
         """
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
+        # Fusions find their estimates by number of the kind: kinds that cannot be smoothed are None, and not fused.
         parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
             _, fused, _ = fusion.step((), parts, jnp.asarray(0))

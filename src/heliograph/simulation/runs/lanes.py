@@ -145,7 +145,7 @@ def advance_in_chunks(
         progress: is called with how many runs are done, and of how many.
     """
     count, chunk = runs
-    blocks = -(-min(chunk, count) // BLOCK)  # of a chunk
+    blocks = -(-min(chunk, count) // BLOCK)  # of a chunk, rounded up
     if blocks >= lanes or wide:
         blocks = lanes * -(-blocks // lanes)
     parts = []

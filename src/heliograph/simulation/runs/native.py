@@ -382,5 +382,5 @@ def _run_chunks(
     `chunk`: how many runs between two reports of progress. `memory`: as of `NativeLanes`; None: new memory.
     """
     lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
-    parts = advance_in_chunks(lanes.advance, LANES, False, (runs, chunk), progress)
+    parts = advance_in_chunks(lanes.advance, LANES, wide=False, runs=(runs, chunk), progress=progress)
     return lanes.total()._replace(collected=lanes.join_chunks(parts))

@@ -52,7 +52,7 @@ class NativeLanes:
             return collected
 
         collected_by_lane = list(get_thread_pool().map(simulate_lane, used))
-        # Each leaf of all lanes, as runs in order; None where all runs share it.
+        # Each leaf of all lanes, with the runs sorted by their numbers; None where all runs share it.
         order = np.argsort(np.concatenate([runs_of_lane[lane] for lane in used]), kind="stable")
         leaves: list[np.ndarray | None] = []
         for parts in zip(*collected_by_lane, strict=True):
@@ -77,7 +77,7 @@ class NativeLanes:
             leaves.append(by_batch if fixed is None else to_double(fixed))
             common.append(fixed is not None)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return ReducedRuns(sums, same, count_runs_by_batch(self.first_run, self.stop), None)
+        return ReducedRuns(sums=sums, common=same, runs=count_runs_by_batch(self.first_run, self.stop), collected=None)
 
     def join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return what is collected of all runs (run, ...), from what `advance` returned of each chunk of them.
