@@ -322,6 +322,7 @@ class Mesh(Module):
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
         """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
         known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
+        # In each round a node comes to have what the senders of the messages that arrive had before it.
         for number in range(self.edges.rounds):
             known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
         return known

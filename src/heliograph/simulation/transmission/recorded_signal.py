@@ -62,6 +62,7 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
         k, y_k = row
         missing = jnp.isnan(y_k)
         state, h = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
+        # Outputs to which G, h without its last row and column, carries a number that was not sent.
         unsent = jnp.any((h[:-1, :-1] != 0) & missing, axis=1)
         return state, jnp.where(unsent, jnp.nan, apply(h, jnp.where(missing, 0.0, y_k)))
 

@@ -161,7 +161,7 @@ def deliver_signal(
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
     """
     link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
-    if link.past:
+    if link.past:  # a late link carries y and the signals before it, the last first
         line = jnp.concatenate([y, state.line])
         after, h = _draw_link(link, state.channel, key, k, link_key, shared)
         return LateChannelState(after, line[: -len(y)]), apply(h, line)

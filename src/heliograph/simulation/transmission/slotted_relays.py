@@ -65,7 +65,8 @@ class SlottedRelays(AbstractMedium):
         y = sensor.noise.report(sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR)))
         signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
-        # Hops without memory by a branch for the slot, then those with memory.
+        # Hops without memory by a branch of the program for the slot. Those with memory are drawn at every step, since
+        # their memories move on, and count in their own slot.
         received = self._sum_without_memory(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
         for name, hop in find_hops_with_memory(self.relays).items():
