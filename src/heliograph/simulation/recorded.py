@@ -130,8 +130,7 @@ def run(
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     _warn_of_record(network, record, state)
-    # Where the rows end, for forecasts and later rows. Rows without times are numbered: all are as far apart as the
-    # first two.
+    # Where the rows end, for forecasts and later rows. Rows without times are all as far apart as the first two.
     origin = _make_origin(network, record, state, u, usual_spacing(clock if times is not None else clock[:2]))
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
