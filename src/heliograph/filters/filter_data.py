@@ -128,8 +128,8 @@ def scan_with_last_state(
         begin: number of the first row.
     """
 
-    # A derivative backwards keeps of each row the state before it, and computes the row again: all numbers of a row
-    # would be some 540 for 17, which take longer to store and read than to compute.
+    # A derivative backwards keeps of each row the state before it, say 17 numbers, and computes the row again. To keep
+    # all some 540 numbers of the row takes longer, as they are stored and read.
     @partial(jax.checkpoint, prevent_cse=False)
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
@@ -160,7 +160,8 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     if before is not None and dates is not None:
         _check_later(before, dates)
     start = () if before is None else (before.state, np.asarray(begin))
-    # Three ways, the first that applies: chunks side by side, the filter's own native code for rows, one scan.
+    # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
+    # return None where they do not apply.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))

@@ -205,19 +205,21 @@ def _summarise_output(value: Float[np.ndarray, " time"], variance: np.ndarray, w
     """
     arrived = np.isfinite(value)
     e, w, squares = value[arrived], weight[arrived], value[arrived] ** 2 / variance[arrived]
-    down, count = int(np.sum(w < HALF)), len(e)
+    is_down_weighted, count = w < HALF, len(e)
     if not count:
         nan = float("nan")
         return InnovationSummary(
             expected=len(value), received=0, down_weighted=0, share=wilson(0, 0), independent=0.0,
             weight=nan, bias=nan, bias_low=nan, bias_high=nan, squared=nan,
         )  # fmt: skip
-    # The median lies with 95 % between the quantiles 1/2 -+ 1.96 / (2 sqrt N), N values that count as independent.
-    independent_ranks = count_independent(np.argsort(np.argsort(e)).astype(float))
-    reach = NORMAL / (2 * np.sqrt(independent_ranks))
+    # The median lies with 95 % between the quantiles 1/2 -+ 1.96 / (2 sqrt N). N is the number of independent values
+    # that say as much; it is found by the correlation of ranks, as outliers would dominate that of the values.
+    ranks = np.argsort(np.argsort(e)).astype(float)
+    reach = NORMAL / (2 * np.sqrt(count_independent(ranks)))
     low, median, high = np.quantile(e, [max(0.5 - reach, 0.0), 0.5, min(0.5 + reach, 1.0)])
     # The number of independent values again, for the share that was down-weighted.
-    independent = count_independent((w < HALF).astype(float))
+    down = int(np.sum(is_down_weighted))
+    independent = count_independent(is_down_weighted.astype(float))
     return InnovationSummary(
         expected=len(value),
         received=count,

@@ -197,7 +197,7 @@ def judge_step(
     by_correction = loses_soundness | _overflows(state_prior, state_after)
     loses_soundness = _is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
-    # The reason, later lines before earlier ones: prediction, then far, then unsound, then excluded.
+    # The reason. Where several apply, prediction goes before far, that before unsound, and that before excluded.
     reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
     reason = jnp.where(by_correction & of_value.came & ~of_value.far, Reason.UNSOUND, reason)
     reason = jnp.where(by_prediction, Reason.PREDICTION, reason)
@@ -207,7 +207,12 @@ def judge_step(
     input_verdict = jnp.nan if claim == "none" else loses_digits
     # No distance where nothing arrived, and from an estimate that was no number before.
     distance = jnp.where((count > 0) & (is_sound | (reason > 0)), distance, jnp.nan)
-    return Judgement(distance, count, reason.astype(count.dtype), jnp.asarray(input_verdict))
+    return Judgement(
+        distance=distance,
+        arrived=count,
+        reason=reason.astype(count.dtype),
+        input=jnp.asarray(input_verdict),
+    )
 
 
 class _JudgedValue(NamedTuple):
@@ -239,7 +244,7 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     # Far: components larger than expected, beyond the bound of this precision.
     larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
     squares, determined = every, certain
-    if len(value) > 1:
+    if len(value) > 1:  # a single component has no others that are left out
         squares, determined = _squared_distance_terms_in_turn(value, covariance, larger, size)
     free = jnp.where(larger & ~determined, squares, 0.0)
     most = greatest_distance(value.dtype)
@@ -248,7 +253,13 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
     if of_atoms:
         excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
-    return _JudgedValue(distance, count, far, excluded, (count > 0) | jnp.any(~jnp.isnan(z)))
+    return _JudgedValue(
+        distance=distance,
+        arrived=count,
+        far=far,
+        excluded=excluded,
+        came=(count > 0) | jnp.any(~jnp.isnan(z)),
+    )
 
 
 def _squared_distance_terms_in_turn(

@@ -103,10 +103,10 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
         # Components without variance, up to rounding, stay where they are.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
         rows, centre = turn.T @ rows, turn.T @ centre
-        size = jnp.maximum(variance, least)
-        moments = ball_moments(centre, size, radius, inside)
+        variance_or_least = jnp.maximum(variance, least)
+        moments = ball_moments(centre, variance_or_least, radius, inside)
         varies = (variance > least) & jnp.isfinite(moments.log_mass)
-        gain = jnp.where(varies, (x.root * x.variances) @ rows.T / size, 0.0)
+        gain = jnp.where(varies, (x.root * x.variances) @ rows.T / variance_or_least, 0.0)
         # x given e, without noise; then what e itself still varies in the region.
         given, _ = condition_on_observation(x, rows, jnp.zeros(len(rows)), zero_covariance(len(rows)), varies)
         mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)

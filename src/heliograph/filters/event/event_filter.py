@@ -280,7 +280,7 @@ class EventFilter(AbstractSizedFilter):
         Returns the sum over (x, r), one Gaussian padded with others of no weight, and the mean and covariance predicted
         of a value that comes; arguments as of `_condition_on_silence`.
         """
-        # Probability that this pattern of values arrives, by mode of the link.
+        # Probability that this pattern of values arrives, by mode of the link: the first axis of a Gaussian's label.
         sender, arrived = self.senders[s], ~jnp.isnan(z)
         pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
         kind = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
@@ -306,8 +306,8 @@ class EventFilter(AbstractSizedFilter):
         count, size = len(links), len(label)
         sent = self._select_sent(concatenate([*updated, *before]), s, begun)
         pieces = [sent.take(start, start + size) for start in range(0, len(sent.log_weight), size)]
-        by_mode = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]
-        sent_updated, sent_before = by_mode[:count], by_mode[count:]
+        by_part = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
+        sent_updated, sent_before = by_part[:count], by_part[count:]
         # One Gaussian again, with a new reference.
         merged = merge_groups(concatenate(sent_updated).select_components(self._find_new_reference(sender)))
         merged = merged.relabel_sender(s, relabel_sent(merged.label[:, s], lost=False))

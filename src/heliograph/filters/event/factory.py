@@ -38,9 +38,9 @@ def event_filter(
     """Return the filter that knows when its sender sends, and so what it means that nothing came.
 
     Silence says that y lies within delta of the sender's reference, or that what was sent was lost. The filter carries
-    a sum of Gaussians of (x, r), r the sender's reference: `known` of them where r is the value that came last, one for
-    each part of the interval in which y - r lay last, and at most `lost` where r is a value that was lost. With one of
-    each it costs a third, and claims up to 9 % too little variance in slow plants.
+    a sum of Gaussians of (x, r), r the sender's reference. In `known` of them r is the value that came last; each of
+    these has its own part of the interval in which y - r lay last. In at most `lost` others r is a value that was lost.
+    With one of each it costs a third, and claims up to 9 % too little variance in slow plants.
 
     `channel` has the losses in it (`erasure`, `gilbert_elliott` of erasures): which of them the receiver knows of,
     `trigger` says. A nonlinear plant or sensor goes through `transform`, `Cubature()` unless given (`Linearization()`
@@ -70,15 +70,15 @@ def event_filter(
     check_link(first(sensor), first(channel), len(start.states))
     refuse_angles("event filter", plant, sensor)
     trigger.check_outputs(len(first(sensor).outputs))
-    # Law of what arrives, for each step.
     known, lost = check_count("known", known), check_count("lost", lost, 0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
+    # Law of what arrives at each step, by mode of the link and by which components arrive.
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
     loses = any(_may_lose(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
-    shared: dict[str, Any] = {
+    fields_of_both: dict[str, Any] = {  # of the filter of a random trigger, and of that of a threshold
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
         "loses": loses, "outputs": outputs,
     }  # fmt: skip
@@ -87,7 +87,7 @@ def event_filter(
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _decide_claim(plant, sensor, channel, trigger)
         return on_premise(
-            StochasticEventFilter(trigger=trigger, **shared, **make_sizes(claim, start, received)), premise
+            StochasticEventFilter(trigger=trigger, **fields_of_both, **make_sizes(claim, start, received)), premise
         )
     # A threshold: a sum of Gaussians, by the value with which the sender compares. Ages of that value are counted up to
     # the heartbeat.
@@ -98,7 +98,7 @@ def event_filter(
         delivers=all(_delivers_y_unchanged(step) for step in steps),
         alike=all(_has_same_law_in_every_mode(step) for step in steps),
         ages=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
-        **shared,
+        **fields_of_both,
         **make_sizes("nominal", start, received),
     )
     return on_premise(filter, premise)

@@ -152,6 +152,7 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     size, places = len(parts.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
+    # Weights over the largest one, so that not all of them underflow; where all are 0 there is no largest one.
     top = jnp.max(parts.log_weight)
     weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
     centre, spread = parts.gaussian.mean[:, places], jax.vmap(lambda x: x.columns.diagonal)(parts.gaussian)[:, places]

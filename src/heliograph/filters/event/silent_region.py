@@ -65,7 +65,7 @@ class SilentRegion(NamedTuple):
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
         cut = concatenate([known] * self.known)
         if self.is_ball:
-            if self.known > 1:
+            if self.known > 1:  # a single piece is the whole ball
                 cut = truncate_between(cut, direction, low * delta, high * delta)
             cut = self._truncate_to_ball(concatenate([cut, unknown]), sender, 1.0, inside=True)
         else:

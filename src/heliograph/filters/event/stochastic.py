@@ -121,8 +121,8 @@ class StochasticEventFilter(AbstractSizedFilter):
             value = jnp.append(value, flag_innovation)
         # The sum's one Gaussian, and the law of the link's modes, which is its label.
         x: Gaussian = jax.tree.map(lambda leaf: leaf[0], after.gaussian)
-        following = StochasticBelief(x, after.label[0, 0], state.reference, state.moved)
-        return following, Innovation(value, covariance, log_likelihood)
+        corrected = StochasticBelief(x, after.label[0, 0], reference=state.reference, moved=state.moved)
+        return corrected, Innovation(value, covariance, log_likelihood)
 
     def _condition_on_sending(
         self,

@@ -31,7 +31,7 @@ PAIR = 2  # computed side by side: of one alone each operation waits for the one
 Moments = Callable[..., TruncatedNormal]
 
 
-def _compute_pair_by_pair(moments: Moments) -> Moments:
+def _loop_two_intervals_at_a_time(moments: Moments) -> Moments:
     """Return the function as one operation, of which native code holds the code once, for PAIR intervals at a time."""
 
     def compute_in_loop(*ends: jax.Array) -> TruncatedNormal:
@@ -43,7 +43,7 @@ def _compute_pair_by_pair(moments: Moments) -> Moments:
     return operation(compute_in_loop)(moments)
 
 
-@_compute_pair_by_pair
+@_loop_two_intervals_at_a_time
 def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     """Return log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
@@ -95,7 +95,7 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
 
 
-@_compute_pair_by_pair
+@_loop_two_intervals_at_a_time
 def upper_tail(lower: jax.Array) -> TruncatedNormal:
     """Return log mass, mean and variance of N(0, 1) above `lower`, by a tenth of `truncated_normal`'s operations.
 

@@ -51,9 +51,9 @@ def _make_gaussian_filter(
     channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
-    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
+    mean, covariance, prior_given = prior_of(start, initial_mean, initial_covariance)
+    premise = Premise(plant, sensor, channel)  # what the claim rests on: the channel with its memory
     # Moments of the channel without its memory: where that matters, the described channel is not the true one.
-    premise = Premise(plant, sensor, channel)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe_channel_moments(channel, update)
@@ -70,7 +70,7 @@ def _make_gaussian_filter(
         transform=transform,
         rule=update.described(),
         initial_mean=mean,
-        initial_covariance=spread,
+        initial_covariance=covariance,
         linear=linear,
         observed_angles=angles,
         **make_sizes(claim, start, first(channel).outputs),

@@ -66,7 +66,9 @@ class GaussianFilter(AbstractBeliefFilter):
     def expect_signals(
         self, z: Float[Array, "*runs steps m"], u: Float[Array, "steps inputs"]
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z (angles near them).
+        """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z.
+
+        Angles in z are turned by whole turns to near what is expected of them.
 
         Args:
             z: measurements of a run, or of several.

@@ -135,7 +135,7 @@ class FilterStep(NamedTuple):
     def differentiate(self, d: ModelMatrices, before: MomentSlopes) -> tuple[MomentSlopes, jax.Array, jax.Array]:
         """Return the derivatives, in one free number, of the estimate after the step, and of e and S.
 
-        With a dash for the derivative, P the predicted covariance, C = P H', K = C S^-1, w = S^-1 e:
+        A dash is the derivative; m- and P are the predicted mean and covariance, C = P H', K = C S^-1, w = S^-1 e:
 
             m-' = F m' + F' m + b',   P' = F (P of before)' F' + (F' (P of before) F' and its transpose) + Q',
             C' = P' H' + P (H')',   e' = -(H m-' + H' m- + c'),   S' = H C' + H' C + R',

@@ -70,7 +70,8 @@ def true_error(
     Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
     """
     _check_fits(filter, plant, sensor, channel)
-    start, n = first(plant), len(first(plant).states)
+    states = first(plant).states
+    n = len(states)
     # Gains of the filter for these inputs.
     u = array("inputs", np.zeros((check_horizon(horizon), 0)) if inputs is None else inputs, (horizon, None))
     planned = filter.planned(u)
@@ -79,13 +80,14 @@ def true_error(
     # A late channel: past signals are states too.
     if first(channel).past:
         plant, sensor, channel = with_past(plant, sensor, channel)
-    begin, total = first(plant), len(first(plant).states)  # n, and the past signals
+    enlarged = first(plant)
+    total = len(enlarged.states)  # n, and the past signals
     initial, world = channels_by_mode(channel)  # P(j) at the start, and the channel in each mode j, at each step
     projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
     # N_j at the start, with r = (x, 1, s): P(j) E[r r'], where only x has a covariance; s is the planned start.
-    mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
+    mean = np.concatenate([enlarged.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
-    square[:total, :total] += begin.initial_covariance
+    square[:total, :total] += enlarged.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
     # Error x - xhat = D r; one prediction and one correction per step. The modes move from the second step on.
     difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
@@ -96,7 +98,7 @@ def true_error(
         true.append(difference @ moments.sum(axis=0) @ difference.T)
     # Claimed covariances lie as start, then before and after correction of each step: every second one from the third.
     claimed = np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2]
-    return TrueError(start.states, claimed, np.array(true))
+    return TrueError(states, claimed, np.array(true))
 
 
 def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:

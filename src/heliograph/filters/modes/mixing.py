@@ -170,7 +170,8 @@ def mix_and_predict(
     if not isinstance(plant, LinearPlant):
         mixtures = jax.vmap(partial(merge_mixture, parts), in_axes=1)(share)
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
-    # A linear plant moves the parts before they are mixed, so that n parts are moved rather than all mixtures.
+    # A linear plant moves the parts before they are mixed, each once rather than once for each mixture: their means
+    # A m + shift(u), the shift with the mean of w in it, and their covariances A P A'.
     matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
@@ -220,8 +221,8 @@ def move_by_law(
         before = jax.tree.map(lambda leaf, sources=sources: leaf[sources], mixtures)
         results.append(_predict_each(plant, transform, before, u, start))
     moved_order = np.concatenate([np.flatnonzero(plant_of_component == number) for number in range(len(plants))])
-    order = np.argsort(moved_order)
-    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *results)
+    place_among_results = np.argsort(moved_order)  # of each component: the inverse permutation
+    joined: Gaussian = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place_among_results], *results)
     return joined
 
 

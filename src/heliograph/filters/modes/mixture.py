@@ -75,6 +75,19 @@ class MixtureBelief(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
+class _CombinationUpdate(NamedTuple):
+    """Update by one combination: the state after it, log-likelihood, innovation z - E z, and covariance of z.
+
+    `certain` counts components of z that arrived and that the combination determines.
+    """
+
+    after: Gaussian
+    log_likelihood: jax.Array
+    certain: jax.Array
+    value: jax.Array
+    covariance: jax.Array
+
+
 class MixtureFilter(AbstractSizedFilter):
     """One Gaussian for the state; at each step every combination of the measurement's atoms, then moment matching.
 
@@ -130,26 +143,27 @@ class MixtureFilter(AbstractSizedFilter):
         size = square_root(second_moments_at_start(self.plant))  # of the states, for the rounding of gain @ x
         present = ~jnp.isnan(z)
 
-        def condition_on_combination(
-            gain: jax.Array, offset: jax.Array, noise: WeightedColumns
-        ) -> tuple[Gaussian, tuple[jax.Array, ...]]:
-            """Return one combination's update, and log-likelihood, count of exact components, innovation and Cov z."""
+        def condition_on_combination(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> _CombinationUpdate:
+            """Return the Kalman update by z = gain x + offset + noise."""
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
             after, innovations = condition_on_observation(x, slopes, value, noise, present)
-            likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
-            total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
-            return after, (likelihood, jnp.sum(present & innovations.determined), value, total)
+            log_likelihood = innovations.log_density(present, jnp.abs(z) + jnp.abs(z - value))
+            covariance = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
+            certain = jnp.sum(present & innovations.determined)
+            return _CombinationUpdate(after, log_likelihood, certain, value=value, covariance=covariance)
 
-        after, (likelihood, certain, value, total) = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
+        updates = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
         # Posterior weights of the combinations; `excluded` where none of them can produce z: the state stays.
-        weight, density, excluded = posterior_weights(prior, drop_below_point_mass(likelihood, certain))
+        log_likelihood = drop_below_point_mass(updates.log_likelihood, updates.certain)
+        weight, density, excluded = posterior_weights(prior, log_likelihood)
         # Innovation of the mixture, angles near that of the most probable combination.
-        value = wrap_near(value, value[jnp.argmax(prior)], self.observed_angles)
-        total = jnp.where(present[:, None] & present, total, jnp.nan)
-        innovation = mixed_innovation(prior, value, total, density)
-        modes = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
-        updated = MixtureBelief(merge_mixture(after, weight), modes, state.moved)
+        value = wrap_near(updates.value, updates.value[jnp.argmax(prior)], self.observed_angles)
+        covariance = jnp.where(present[:, None] & present, updates.covariance, jnp.nan)
+        innovation = mixed_innovation(prior, value, covariance, density)
+        # The probability of a mode is that of all its combinations.
+        law = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
+        updated = MixtureBelief(gaussian=merge_mixture(updates.after, weight), law=law, moved=state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates

@@ -98,25 +98,25 @@ class ModeObservedFilter(AbstractSizedFilter):
         """
         sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         m = channel.outputs
-        z, published = observed[:m], observed[m:]
+        z, memory_states = observed[:m], observed[m:]
         # At the first step there are no states of a step before: none are needed.
-        is_known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
-        modes = jnp.nan_to_num(published)
+        is_known = ~jnp.any(jnp.isnan(memory_states)) | (~state.begun if self.late else False)
+        states_or_zero = jnp.nan_to_num(memory_states)  # what is computed with a 0 for a NaN is not used
         if self.late:
             # The states that came are those of the step before: use them there first.
-            redone = self._redo_last_step(state, modes, k)
+            redone = self._redo_last_step(state, states_or_zero, k)
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
-            described = self._describe_channel_after(state.begun, modes, k)
+            described = self._describe_channel_after(state.begun, states_or_zero, k)
         else:
-            prior, described = state.belief, _condition_channel(channel, modes)
+            prior, described = state.belief, _condition_channel(channel, states_or_zero)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = correct_linear(prior, sensor, described, Polytope(), z, second_moments_at_start(self.plant))
         after = jax.tree.map(lambda a, b: jnp.where(is_known, a, b), after, prior)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
-        # The flags belong to the innovation; they add nothing to the likelihood.
-        for mode in published:
-            flag_innovation, spread = append_flag(spread, mode)
+        # The innovation has a place for each number that arrives, also for these; they add nothing to the likelihood.
+        for memory_state in memory_states:
+            flag_innovation, spread = append_flag(spread, memory_state)
             value = jnp.append(value, flag_innovation)
         belief = ModeObservedBelief(belief=after, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)

@@ -172,8 +172,8 @@ class SideInformationFilter(AbstractSizedFilter):
         flag_chance = jnp.where(flag_arrived, jnp.asarray(channel.flags)[:, number], 1.0)
         pattern = pattern_of(channel, arrived)
         weight = jnp.asarray(channel.chance)[:, pattern] * flag_chance
-        # Moments given the side information: each mode's grow by the factor weight = P(mode | it) / P(mode), which is
-        # by `excess`.
+        # Moments given the side information: those of each mode are multiplied by weight = P(mode | side information)
+        # / P(mode); `excess` is what is added to them by it.
         _, x, weights = _split_columns(state)
         weight = weight / (weight @ _mode_probabilities(x, weights))
         prior = state._replace(variances=jnp.asarray(weight)[:, None] * state.variances)
@@ -259,14 +259,15 @@ def _describe_received(
         gain_spread: the tensor of T_j (M, m, m, p + 1, p + 1).
         link: columns of Cov n_j (M, m, m).
     """
-    (measure, noise), (_, x, weights) = centred_measurement(sensor, state.centre), _split_columns(state)
+    measure, noise = centred_measurement(sensor, state.centre)  # C~ and R~
+    _, x, weights = _split_columns(state)
     law = _mode_probabilities(x, weights)
 
     def describe_noise(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
         """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain."""
-        sent = x.through(measure).covariance + p * noise
+        sent = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
         return triangularise(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
@@ -274,9 +275,8 @@ def _describe_received(
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
     output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
-    return ReceivedModel(
-        output, common, jax.vmap(describe_noise)(gains, gain_spread, link, WeightedColumns(x, weights), law)
-    )
+    noises = jax.vmap(describe_noise)(gains, gain_spread, link, WeightedColumns(x, weights), law)
+    return ReceivedModel(output=output, common=common, noise=noises)
 
 
 def _project_on_data(

@@ -126,7 +126,7 @@ def _compile_programs(
         u: inputs.
         keys: of noises and of proposals, (rows, ...) each.
     """
-    # As many particles as fill whole groups, and arrays that several programs read: the row, particles, weights.
+    # Their number rounded up to whole groups, and the arrays that several programs read: row, particles, weights.
     length = -(-filter.particles // GROUP) * GROUP
     numbers = np.arange(length, dtype=np.uint32)
     noise_key, proposal_key = (np.zeros_like(part[0]) for part in keys)
@@ -142,10 +142,10 @@ def _compile_programs(
     advance = _bind_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
     if advance is None:
         return None
-    leaves, form = jax.tree.flatten(particles)
-    now = jax.tree.unflatten(form, advance.outputs[: len(leaves)])
+    leaves, structure = jax.tree.flatten(particles)
+    now = jax.tree.unflatten(structure, advance.outputs[: len(leaves)])
     log_weight_now, predicted = advance.outputs[len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
-    # Second and third: sums over the particles of a group in each lane.
+    # Second and third: sums over the particles of a group in each lane. `reference`: from what innovations are counted.
     reference = tuple(np.zeros(part.shape[1:]) for part in predicted)
     group: ParticleGroup = jax.tree.map(
         lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]),
@@ -159,8 +159,8 @@ def _compile_programs(
     second = _bind_in_place(_sum_second, filter, arguments, (False, True, True), len(group.weight))
     if second is None:
         return None
-    memory = _RowMemory(*before, prior, weight, reference, states)
-    return _ParticlePrograms(memory, now, log_weight_now, predicted, advance, first, second)
+    memory = _RowMemory(*before, prior=prior, weight=weight, reference=reference, states=states)
+    return _ParticlePrograms(memory, now, log_weight_now, predicted, advance=advance, first=first, second=second)
 
 
 def _bind_in_place(
@@ -252,14 +252,14 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     `z`: (rows, received), NaN for what did not arrive; `u`: (rows, inputs). `state`: that after the row before; None at
     the start, where particles are drawn.
     """
-    # Random keys of all rows, which depend on the data and on no particle.
+    # Random keys of all rows at once: they depend on the data, and on no particle.
     key = None if state is None else np.asarray(state.key)
     start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
         _draw_keys, _draw_keys_by_xla, (filter, z, key)
     )
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
-    rows = DataRow(k, z, u, noise_keys, proposal_keys, moved)
+    rows = DataRow(k=k, z=z, u=u, noise_key=noise_keys, proposal_key=proposal_keys, moved=moved)
     programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
     if programs is None:
         return None
@@ -275,7 +275,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         loop.begin(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
     # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
     steps = [
-        loop.step(DataRow(*row), choice_start)
+        loop.filter_row(DataRow(*row), choice_start)
         for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
     ]
     sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
@@ -333,15 +333,15 @@ class _ParticleLoop:
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
 
-    def step(self, row: DataRow, start: float) -> ParticleSums:
-        """Choose the particles that go on, move and weigh them; return the sums over them.
+    def filter_row(self, row: DataRow, choice_start: float) -> ParticleSums:
+        """Choose the particles that go on, move and weigh them, in place; return the sums over them.
 
-        `start`: a uniform number, with which the choice begins.
+        `choice_start`: a uniform number, with which the choice begins.
         """
         memory, programs = self.memory, self.programs
         for held, new in zip(memory.row, row, strict=True):
             held[...] = new
-        self._choose_particles(start)
+        self._choose_particles(choice_start)
         # Move and weigh; a row that no particle explains is not used: they are only moved.
         used = self.filter.always_used or not np.isnan(row.z).all()
         largest = self._advance(used)
@@ -360,10 +360,10 @@ class _ParticleLoop:
         second = np.einsum("ijk->jk", programs.second.outputs[0])
         # The sums of states begin with those of weights and of their squares. log p(z) is log of the sum of weights
         # with z less that of weights before.
-        before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
-        density = -np.inf if excluded else math.log(self.sum) + largest - math.log(before)
+        sum_before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
+        density = -np.inf if excluded else math.log(self.sum) + largest - math.log(sum_before)
         reference = tuple(part.copy() for part in memory.reference)
-        return ParticleSums(states.copy(), received, second, reference, np.asarray(density))
+        return ParticleSums(states.copy(), received, second, reference=reference, density=np.asarray(density))
 
     def _choose_particles(self, start: float) -> None:
         """Let particles go on as they are, or resampled where the effective number is too small."""

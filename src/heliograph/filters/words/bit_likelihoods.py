@@ -64,17 +64,18 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
         expected = "a link that is not late (linear_filter takes delays)"
         raise fail("channel of a word filter", expected, f"one late by up to {channel.past} steps")
     if not channel.remembers:
-        fixed = _fix_rates(channel)
+        fixed = _fix_rates(channel)  # pairs (probability, link of these error rates)
         weights = np.array([[share for share, _ in fixed]], dtype=float)
         return LinkOfBits(links=tuple(link for _, link in fixed), weights=weights, flag=None)
-    told = list_told_modes(channel)
-    if not told:
+    # The link as it is in each mode, of which the number comes with the words (a told mode).
+    link_by_mode = list_told_modes(channel)
+    if not link_by_mode:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
-    # The combinations of all modes, one mode after another; each mode has probabilities for its own.
-    combinations = [_fix_rates(in_mode) for in_mode in told]
+    # All links of known error rates, mode after mode. In each mode only its own have a probability above 0.
+    combinations = [_fix_rates(in_mode) for in_mode in link_by_mode]
     links = [link for of_mode in combinations for _, link in of_mode]
-    weights = np.zeros((len(told), len(links)))
+    weights = np.zeros((len(link_by_mode), len(links)))
     start = 0
     for mode, of_mode in enumerate(combinations):
         weights[mode, start : start + len(of_mode)] = [share for share, _ in of_mode]

@@ -88,8 +88,9 @@ def word_filter(
     quarter of it, which changes the mean by 1e-4 deviations and the variance by .6 %. At p = .01 and 8 bits it has half
     the error of the best linear filter, and is as good as with a checksum that costs no bit.
 
-    Where bits flip it carries two Gaussians, by whether the last word was right in its leading bits. One of both, at a
-    third of the cost, takes a place that wrong bits made probable for certain, now and then for tens of steps.
+    Where bits flip it carries two Gaussians: one given that the leading bits of the last word were right, one given
+    that they were not. A single Gaussian costs a third; now and then it takes what wrong bits say for certain, and is
+    far off for tens of steps.
 
     One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
     drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates. Words
@@ -101,7 +102,7 @@ def word_filter(
         channel: of words, from the sensor to the filter: all arrives by default.
         encoder: `Words` of the sender; None for a sensor that reports multiples of its resolution.
         transform: moments of a plant or sensor that is not linear, `Cubature()` by default.
-        hypotheses: 2, Gaussians that are carried where bits flip; or 1 (default 2).
+        hypotheses: number of Gaussians that are carried where bits flip, 2 (default) or 1.
 
     Claim: "nominal": the prior is not Gaussian after the first word. The squared error is as claimed within a tenth
     where a step is at most three deviations of y, and everywhere with a dither that is taken off.

@@ -121,16 +121,18 @@ def build_behind_words(
             "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
         )
     # The sensor of y - c with rounding, and the filter of numbers behind it.
-    gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers  # filters of modes use bounds
+    # Whether the rounding of a Gaussian y is described exactly; filters of modes, and of past signals, use bounds.
+    gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers
     rounded = at_each_step(lambda of_step: _round_sensor(of_step, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, places)
     refuse_overload(overload)
-    words = tuple(i for i, place in enumerate(places) if place != FLAG)
+    words = tuple(i for i, place in enumerate(places) if place != FLAG)  # rows of z that are words
     centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
     gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
-    late: Claim = "upper" if first(channel).past else "exact"  # before the first word its noise is none, and claimed
-    claim = weakest([lower_by_noise(base.claim, rounded), late, _claim_of(overload)])
+    # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
+    claim_of_delay: Claim = "upper" if first(channel).past else "exact"
+    claim = weakest([lower_by_noise(base.claim, rounded), claim_of_delay, _claim_of(overload)])
     return LinearWordsFilter(
         base=base,
         centres=centres,

@@ -35,41 +35,41 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: Sig
         grid: the words.
         prior: of y.
     """
-    # b = `level`: cells of `size` words, of which `low` are the bits.
+    # b = `low_bits`: each cell has 2^b words, which differ in their b lowest bits.
     bits = np.arange(grid.bits)
-    level = jnp.floor(jnp.log2(jnp.maximum(prior.deviation * FINE / grid.step, 1.0)))
-    level = jnp.minimum(level, grid.bits - 1.0)
-    size, low = jnp.round(jnp.exp2(level)), bits < level
-    # The low bits, the same in every cell.
+    low_bits = jnp.floor(jnp.log2(jnp.maximum(prior.deviation * FINE / grid.step, 1.0)))
+    low_bits = jnp.minimum(low_bits, grid.bits - 1.0)
+    words_of_cell, is_low = jnp.round(jnp.exp2(low_bits)), bits < low_bits
+    # mu in steps above the cell's first word, v, and the likelihood of the low bits: the same in every cell.
     total = jnp.sum(pairs, axis=1)
     ones = pairs[:, 1] / total
-    mean = jnp.sum(jnp.where(low, 2.0**bits * ones, 0.0))
-    variance = grid.step**2 * (jnp.sum(jnp.where(low, 4.0**bits * ones * (1 - ones), 0.0)) + 1 / 12)
-    inner = jnp.prod(jnp.where(low, total, 1.0))
-    # Each cell is a Gaussian about mu times the prior of deviation s: its mass is e^(-a^2 / (2 wide)), a = (mu - m) /
-    # s, wide = 1 + v / s^2. Cells are summed in blocks, from REACH deviations below the prior's mean on.
+    mean = jnp.sum(jnp.where(is_low, 2.0**bits * ones, 0.0))
+    variance = grid.step**2 * (jnp.sum(jnp.where(is_low, 4.0**bits * ones * (1 - ones), 0.0)) + 1 / 12)
+    likelihood_of_low = jnp.prod(jnp.where(is_low, total, 1.0))
+    # A cell's Gaussian about mu times the prior of mean m and deviation s has the mass e^(-a^2 / (2 wide)) up to a
+    # factor: a = (mu - m) / s, wide = 1 + v / s^2. Blocks of cells begin REACH deviations below the prior's mean.
     wide = 1 + variance / prior.deviation**2
-    width = size * grid.step / prior.deviation
+    width = words_of_cell * grid.step / prior.deviation
     block = 2.0**MERGED
-    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * size * block)) * block
+    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * words_of_cell * block)) * block
     start = jnp.maximum(start, 0.0)
 
-    def away_of(cell: jax.Array) -> jax.Array:
-        """Return how far the mean of a cell is from the prior's, in the prior's deviations."""
-        return (grid.low + (cell * size + mean) * grid.step - prior.mean) / prior.deviation
+    def distance_of(cell: jax.Array) -> jax.Array:
+        """Return a: how far the mean of a cell is from the prior's, in the prior's deviations."""
+        return (grid.low + (cell * words_of_cell + mean) * grid.step - prior.mean) / prior.deviation
 
     # Likelihoods of the bits of the cells' numbers, and the cell of the received word.
-    upper, received_cell = _shift_bits(pairs, level), jnp.floor(received / size)
-    sums = _sum_blocks(upper, start / block, away_of(start), width, wide)
-    # The cell of the received word, where it is none of them.
+    upper, received_cell = _shift_bits(pairs, low_bits), jnp.floor(received / words_of_cell)
+    sums = _sum_blocks(upper, start / block, distance_of(start), width, wide)
+    # The received word may be far more likely than all others: where no block has its cell, that is added.
     is_outside = (received_cell < start) | (received_cell >= start + BLOCKS * block)
     likelihood = multiply_bits(upper, received_cell) * is_outside
-    likelihood = likelihood * jnp.exp(-(away_of(received_cell) ** 2) / (2 * wide))
+    likelihood = likelihood * jnp.exp(-(distance_of(received_cell) ** 2) / (2 * wide))
     mass, first, second = (
-        sum_over_cells + likelihood * away_of(received_cell) ** power for power, sum_over_cells in enumerate(sums)
+        sum_over_cells + likelihood * distance_of(received_cell) ** power for power, sum_over_cells in enumerate(sums)
     )
     # Of the product of both Gaussians: E t = a / wide, E t^2 = a^2 / wide^2 + 1 - 1 / wide.
-    scale = inner * grid.step / (prior.deviation * ROOT_TWO_PI * jnp.sqrt(wide))
+    scale = likelihood_of_low * grid.step / (prior.deviation * ROOT_TWO_PI * jnp.sqrt(wide))
     first, second = first / wide, second / wide**2
     return LikelihoodSums(scale * mass, scale * first, scale * (second + mass * (1 - 1 / wide)))
 
@@ -93,16 +93,16 @@ def _sum_blocks(
     """
     # e^(-(j w)^2 / (2 v)) is the product of e^(-(2 i + 1) w^2 / (2 v)) over i < j.
     factor = jnp.exp(-(width**2) / (2 * wide))
-    bell, step = [jnp.ones(())], factor
+    bell, next_factor = [jnp.ones(())], factor
     for _ in range(2**MERGED - 1):
-        bell.append(bell[-1] * step)
-        step = step * factor**2
+        bell.append(bell[-1] * next_factor)
+        next_factor = next_factor * factor**2
     # Coefficients of the polynomials (cells of a block, 3): of likelihood, and times j and j^2.
     places = np.arange(2.0**MERGED)
     table = tabulate(pairs[:MERGED]) * jnp.stack(bell)
     coefficients = jnp.stack([table, table * places, table * places**2], axis=1)
-    once = bell[-1] * step  # e^(-(J w)^2 / (2 v))
-    shrink = jnp.exp(-(2**MERGED) * width**2 / wide)
+    bell_of_next_block = bell[-1] * next_factor  # e^(-(J w)^2 / (2 v))
+    ratio_change = jnp.exp(-(2**MERGED) * width**2 / wide)  # of r, from block to block
 
     def add_block(carried: Carried, block: jax.Array) -> tuple[Carried, None]:
         """Add one block: three polynomials in r by Horner's rule, and their terms about the block's first cell."""
@@ -117,7 +117,7 @@ def _sum_blocks(
         power = ratio  # r^J, J = 2^MERGED
         for _ in range(MERGED):
             power = power**2
-        return (sums, density * power * once, ratio * shrink, a + 2**MERGED * width), None
+        return (sums, density * power * bell_of_next_block, ratio * ratio_change, a + 2**MERGED * width), None
 
     start = LikelihoodSums(*jnp.zeros(3)), jnp.exp(-(away**2) / (2 * wide)), jnp.exp(-away * width / wide), away
     (sums, *_), _ = jax.lax.scan(add_block, start, jnp.arange(BLOCKS, dtype=float))

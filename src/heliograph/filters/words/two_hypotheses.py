@@ -78,7 +78,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:
         """Correct with the words that arrived, one component of y after another."""
         base, z, n = self.base, jnp.asarray(z), len(self.states)
-        words = base.read_words(z, at(base.links, k))
+        words = base.identify_received_words(z, at(base.links, k))
 
         def append_measured(part: Gaussian) -> Gaussian:
             """Return the joint law of the state and what is measured, under one hypothesis."""
@@ -138,14 +138,14 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         Returns:
             The hypotheses after word i, and the probability of what came; as they were, if it did not come.
         """
-        # [h, a]: hypothesis h before the word, answer a.
+        # Four parts [h, a]: hypothesis h before the word; answer a to whether this word was right, 0 yes and 1 no.
         parts, mass = jax.lax.map(lambda part: self._split_by_answer(part, i, words), joint.parts)
         mass = mass * joint.weights[:, None]
         total = jnp.sum(mass)
         # All right: this word, and under the first hypothesis those before it. Before the first word of a message
         # either hypothesis is of the message before, and only this word counts.
         right = jnp.array([[True, False], [True, False]]) & jnp.stack([jnp.asarray(True), ~begun])[:, None]
-        flat = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
+        four_parts = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 
         def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
             """Merge the chosen of the four parts; return their probability too. Without any, merge all."""
@@ -155,7 +155,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             shares = jnp.where(
                 probability > 0, chosen_mass / jnp.where(probability > 0, probability, 1.0), shares_of_all
             )
-            return merge_mixture(flat, shares), probability
+            return merge_mixture(four_parts, shares), probability
 
         merged, weights = jax.vmap(merge_chosen)(jnp.stack([right, ~right]))
         used = words.present[i] & (total > 0)

@@ -71,7 +71,7 @@ class WordFilter(AbstractBeliefFilter):
         signal = self.measure(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
-        words = self.read_words(z, at(self.links, k))
+        words = self.identify_received_words(z, at(self.links, k))
         for i in range(len(self.low)):
             row, prior = joint.root[n + i], self.prior_of(joint, i)
             change = self._find_effect_of_word(i, words, prior)
@@ -93,11 +93,12 @@ class WordFilter(AbstractBeliefFilter):
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
-    def read_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
+    def identify_received_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
         """Return which word of each component was received, and what its bits say of those that were sent.
 
-        z has the received words, and flags of modes among them, as `places` says; behind these, where dither is
-        subtracted, the dither of each word. A word is the number i of low + i spacing.
+        z (one step) has a number for each output of the channel: a received word low + i spacing, or the mode of the
+        link (a flag), as `places` says. Where dither is subtracted, the dither of each word follows. The same component
+        may come several times, as copies over several paths. What is returned of a word is its number i.
         """
         outputs = len(self.places)
         # Rows of z that are words, the component of y of each, and how many steps it lies above the lowest word.
@@ -119,14 +120,22 @@ class WordFilter(AbstractBeliefFilter):
             copies = np.flatnonzero(component == i)
             first_copies.append(_pick_first([(arrived[j], number[j], dither[j]) for j in copies]))
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
-        # P(received | sent 0) and P(received | sent 1) of each bit, by each law of the link, and the laws' weights.
+        # P(received | sent 0) and P(received | sent 1) of each bit, under each possible set of error rates of the link,
+        # and the probabilities of these sets.
         pairs, weights = list[jax.Array](), jnp.ones(1)
         if not self.certain:  # bits may flip
             bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)
             received_bits = jnp.stack([1 - bit, bit], axis=-1)
             pairs = link.pairs(jnp.where(arrived[:, None, None], received_bits, 1.0))
             weights = link.weigh(z[:outputs])
-        return ReceivedWords(numbers, dithers, present, pairs, weights, ~jnp.any(no_word & arrived))
+        return ReceivedWords(
+            numbers=numbers,
+            dithers=dithers,
+            present=present,
+            pairs=pairs,
+            weights=weights,
+            are_words=~jnp.any(no_word & arrived),
+        )
 
     def prior_of(self, joint: Gaussian, i: int) -> SignalPrior:
         """Return the law of y_i in that of the state and y."""
@@ -181,25 +190,29 @@ class WordFilter(AbstractBeliefFilter):
             numbers: mean gain and spread that words have as numbers behind the link.
             total: log-likelihood of the words.
         """
-        # y - c with the error of rounding: its variance is `error`.
-        error = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
+        # Moments of y - c, c the centres, with the error of rounding as a noise.
+        rounding_variance = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
         mean = signal.mean - jnp.asarray(self.centre)
-        noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), error))
-        second = signal.covariance + jnp.diag(error) + jnp.outer(mean, mean)
+        noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), rounding_variance))
+        second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
         about_centre = signal._replace(mean=mean, noise=noise, second=second)
+        # Rows of z that are words, and the component of y of each.
         rows = np.array([i for i, place in enumerate(self.places) if place != FLAG])
-        places = np.array(self.places)[rows]
+        component = np.array(self.places)[rows]
         gain = jnp.asarray(numbers.mean_gain)
-        values = z[rows] - jnp.asarray(self.centre)[places]
+        values = z[rows] - jnp.asarray(self.centre)[component]
         # Dithers that are subtracted pass the link's mean gain, as the words do.
         dithers = jnp.sum(gain, axis=1) * z[len(self.places) :] if len(z) > len(self.places) else 0.0
         value = values - dithers - (gain @ mean + jnp.asarray(numbers.offset))
         covariance = innovation_covariance(about_centre, numbers)
         present = ~jnp.isnan(value)
         covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
-        # At the places of words; NaN elsewhere.
-        covariance_of_all = jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance)
-        return Innovation(jnp.full(len(z), jnp.nan).at[rows].set(value), covariance_of_all, total)
+        # In the rows of words; NaN in those of flags and dithers, of which nothing is expected.
+        return Innovation(
+            value=jnp.full(len(z), jnp.nan).at[rows].set(value),
+            covariance=jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance),
+            log_likelihood=total,
+        )
 
 
 class ReceivedWords(NamedTuple):

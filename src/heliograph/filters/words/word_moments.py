@@ -210,21 +210,21 @@ def effect_of_bits(
         prior: of y.
         dither: of the encoder.
     """
-    # Few bits: all words.
+    # Few bits: all words are cheap to sum, and leave no error.
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    def change_by_wide_words() -> WordEffect:
+    def sum_wide_words() -> WordEffect:
         """Sum word by word within the prior's reach."""
         return find_effect_from_sums(sum_window(pairs, weights, received, grid, prior, dither))
 
-    def change_by_fine_words() -> WordEffect:
+    def sum_fine_words() -> WordEffect:
         """Sum over cells of several words each, and over the overloads beyond the ends."""
         wider, wide = widen_by_dither(prior, grid, dither)
         sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
         return take_off_dither(find_effect_from_sums(merged), wide)
 
-    change: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, change_by_wide_words, change_by_fine_words)
-    return change
+    effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)
+    return effect

@@ -134,7 +134,8 @@ def _list_contexts(filter: ToldFilter) -> ToldContexts:
     memories = [affine.memory for affine in told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:
-        if len(memories) > 1 or chains[0].is_uncertain or np.ndim(chains[0].transition) > 2:
+        varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step
+        if len(memories) > 1 or chains[0].is_uncertain or varies:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
         modes = chains[0].modes
         numbers = np.arange(float(modes))[:, None, None]

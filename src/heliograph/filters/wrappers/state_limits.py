@@ -163,7 +163,8 @@ class LimitedFilter(AbstractSizedFilter):
         # Gaussian is, to rounding, the weights stay.
         log_masses, inside = truncate_to_limits(x, self.limits)
         weight = jnp.asarray(held.weight)
-        weight_within = weight * jnp.exp(log_masses).reshape(-1, *[1] * (weight.ndim - 1))
+        beside_weight = (-1, *[1] * (weight.ndim - 1))  # one number for each Gaussian, along the first axis
+        weight_within = weight * jnp.exp(log_masses).reshape(beside_weight)
         mass = jnp.sum(weight_within)
         is_possible = mass > 0
         weight = jnp.where(is_possible, weight_within / jnp.where(is_possible, mass, 1.0), weight)
