@@ -136,8 +136,8 @@ def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResu
 def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> ChunkStarts | None:
     """Return how each chunk of rows begins; None where rows are few, or a start is forgotten too late.
 
-    The shortest chunks of LADDER before whose first row the start is forgotten; first with settled covariances, which
-    cost less, then without.
+    The chunks of LADDER are tried from the shortest on, until the rows before a chunk suffice to forget the start. Of
+    each length it is tried first with settled covariances, which cost less, then without.
     """
     total = len(jax.tree.leaves(rows)[0])
     for lengths in LADDER:
@@ -246,12 +246,13 @@ def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " ch
 
 
 def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
-    """Return whether a wrong start is forgotten `ahead` rows later, at most of PROBES rows; None without native code.
+    """Return whether a wrong start is forgotten `ahead` rows later; None without native code.
 
-    It is forgotten where the state computed from a start `ahead` rows before agrees with that from a start 2 `ahead`
-    rows before. `starts`: one for every `ahead` rows; `first`: first rows of chunks, from which the probes are taken.
+    This is tried before at most PROBES chunks, and must hold for more than half of them. It is forgotten where the
+    state computed from a start `ahead` rows before agrees with that from a start 2 `ahead` rows before. `starts`: one
+    for every `ahead` rows; `first`: first rows of chunks.
     """
-    probes = first[:: -(-len(first) // PROBES)]
+    probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
     once, early = (reach.states_before(rows, starts) for rows in (probes, probes - reach.ahead))
     if once is None:
         return None
@@ -326,7 +327,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
         joined = join_results(programs.settled, parts, [False, False, True, True, True, False])
         return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
 
-    results = scan_settled_by_means(begun, scan, scan_means)
+    results = scan_means_where_settled(begun, scan, scan_means)
     if results is None:
         return None
     rescan_wrong_starts(scan, begun.states, lambda pair: pair[0], results)  # changes the arrays of `results` in place
@@ -334,22 +335,23 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     return ScanResult(jax.tree.map(lambda leaf: leaf[-1, ...], last), outputs)
 
 
-def scan_settled_by_means(
-    begun: ChunkStarts, scan: Callable[[PyTree, Which], PyTree], scan_means: Callable[[SettledState], PyTree]
+def scan_means_where_settled(
+    begun: ChunkStarts, scan_in_full: Callable[[PyTree, Which], PyTree], scan_means: Callable[[SettledState], PyTree]
 ) -> PyTree:
-    """Scan all chunks: those that are settled by their means alone, the others in full; None without native code.
+    """Scan all chunks: of settled ones the means alone, the others in full; None without native code.
 
     Args:
         begun: how the chunks begin.
-        scan: results of some chunks from the states with which these begin.
+        scan_in_full: results of some chunks from the states with which these begin.
         scan_means: results of all chunks, as if they were settled; None where these do not settle.
     """
+    # The means are scanned of all chunks, which does not pay where few are settled.
     settled = None if np.mean(begun.covered) < 0.5 else begun.settled
     results = None if settled is None else scan_means(settled)
     if results is None:
-        return scan(begun.states, slice(None))
+        return scan_in_full(begun.states, slice(None))
     if len(others := np.flatnonzero(~begun.covered)):
-        replace_chunk(results, others, scan(take(begun.states, others), others))
+        replace_chunk(results, others, scan_in_full(take(begun.states, others), others))
     return results
 
 
@@ -371,6 +373,7 @@ def rescan_wrong_starts(
             continue
         chunk = slice(c, c + 1)
         replace_chunk(results, chunk, scan(take(ends, slice(c - 1, c)), chunk))
+        # The chunk ends otherwise now, so that the next one may have begun wrongly, or rightly after all.
         if c < len(wrong):
             wrong[c] = not find_equal_states(take(ends, chunk), take(begun, slice(c + 1, c + 2)), among=begun)[0]
 

@@ -193,9 +193,17 @@ def _describe_end(filter: SteppedFilter, state: PyTree, end: int, u: Array, date
         u: inputs (rows, inputs).
         dates: of the rows; None where they have none, and their numbers are their times.
     """
-    last, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], usual_spacing(dates))
+    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], usual_spacing(dates))
     months = 0 if dates is None else usual_months(dates)
-    return Origin(filter, state, end, last_input(np.asarray(u)), last, spacing, months=months)
+    return Origin(
+        model=filter,
+        state=state,
+        step=end,
+        inputs=last_input(np.asarray(u)),
+        time=last_time,
+        spacing=spacing,
+        months=months,
+    )
 
 
 def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) -> None:
@@ -264,6 +272,7 @@ def check_data(
     judge_dates(filter.inputs, _name_tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
+    # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.
     given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
     u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False, names=filter.inputs)
     check_inputs(filter.inputs, u, filter)

@@ -20,7 +20,7 @@ from heliograph.filters.chunks import (
     find_chunk_starts,
     replace_chunk,
     rescan_wrong_starts,
-    scan_settled_by_means,
+    scan_means_where_settled,
 )
 from heliograph.filters.recursion import linear_start, scan_chunk
 from heliograph.filters.settled_covariance import SettledState
@@ -131,7 +131,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     # behind, none of them beyond the end.
     is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & is_complete)
-    results = scan_settled_by_means(begun, smooth_chunks_from, smooth_means)
+    results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
     # In place: forwards, chunks that began with another state than that in which the one before them ends; then back.

@@ -76,8 +76,8 @@ def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Ar
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
-    wide = BallMoments(tails.log_mass, mean, free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
-    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, wide, strict=True)))
+    outer_pieces = BallMoments(tails.log_mass, mean, covariance=free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
+    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, outer_pieces, strict=True)))
 
 
 def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:

@@ -194,11 +194,12 @@ class StochasticEventFilter(AbstractSizedFilter):
         _, given_silence = self._observe_silence(y, y.root, zero_covariance(len(mean)), mean, reference)
         d = given_silence.mean - mean
         shift = -silent * d / (1 - silent)
-        about = (total - silent * (given_silence.covariance + jnp.outer(d, d))) / (1 - silent) - total
-        # Of z: the mean gain, and the spread, which acts on second moments of (y, 1).
-        second = about + jnp.outer(mean, shift) + jnp.outer(shift, mean)
+        change_about_m = (total - silent * (given_silence.covariance + jnp.outer(d, d))) / (1 - silent) - total
+        # Of z: the mean gain, and the spread, which acts on second moments of (y, 1); these change by `second`.
+        second = change_about_m + jnp.outer(mean, shift) + jnp.outer(shift, mean)
         second = jnp.block([[second, shift[:, None]], [shift, jnp.zeros(1)]])
-        change = gain @ (about - jnp.outer(shift, shift)) @ gain.T + jnp.einsum("ijkl,kl->ij", spread, second)
+        change_of_covariance = change_about_m - jnp.outer(shift, shift)
+        change = gain @ change_of_covariance @ gain.T + jnp.einsum("ijkl,kl->ij", spread, second)
         return gain @ shift, symmetrize(change)
 
     def _log_probability_sent(

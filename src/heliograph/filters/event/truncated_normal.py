@@ -87,8 +87,8 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     at_end = jnp.where(a < 0, jnp.exp(-(a**2) / 2), 1.0)  # phi(a) / phi(t)
     difference = -at_end * jnp.expm1(-(b - a) * (b + a) / 2)
     by_ends = difference / jnp.where(integral > 0, integral, 1.0)
-    short = width * (1 + t) < 1e-2  # there the nodes are as good, and no product of small numbers underflows
-    mean = jnp.where(short & (a >= 0), t + middle, by_ends)
+    is_short = width * (1 + t) < 1e-2  # there the nodes are as good, and no product of small numbers underflows
+    mean = jnp.where(is_short & (a >= 0), t + middle, by_ends)
     mean = jnp.where(jnp.isinf(a) & jnp.isinf(b), 0.0, mean)
 
     log_mass = -(t**2) / 2 + jnp.log(integral) - np.log(2 * np.pi) / 2
@@ -117,9 +117,9 @@ def upper_tail(lower: jax.Array) -> TruncatedNormal:
     x, numerator, denominator = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
     for n in range(DEPTH, 1, -1):
         numerator, denominator = n * denominator, denominator + x * numerator
-    second = numerator / denominator
-    first = 1 / (1 + x * second)
-    mean = a + first / a
+    u_2 = numerator / denominator
+    u_1 = 1 / (1 + x * u_2)
+    mean = a + u_1 / a
     log_mass = -(a**2) / 2 - np.log(2 * np.pi) / 2 - jnp.log(mean)
-    far = TruncatedNormal(log_mass, mean, x * first * (second - first))
+    far = TruncatedNormal(log_mass, mean, x * u_1 * (u_2 - u_1))
     return TruncatedNormal(*(jnp.where(lower < FAR, near_, far_) for near_, far_ in zip(near, far, strict=True)))

@@ -142,6 +142,7 @@ def transform_about_mean(
     The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean change
     from m_i: the error shrinks by the square of the attitudes' deviation in each.
     """
+    # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
     image = transform.image(plant.moves(u, x.mean, middle), x)
     for _ in range(MEAN_STEPS if plant.attitude and not transform.keeps_center else 0):

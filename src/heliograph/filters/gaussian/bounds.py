@@ -105,6 +105,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     prior, present = signal.prior, z.present
     slopes, of_state, _ = _select_received(signal, channel, present)
     # E[y y'] = yhat yhat' + Cov y: the gain's correlation is unknown with the error alone.
+    # Each part as a second moment of (y, 1).
     mean_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
     covariance_part = augmented_second_moment(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     base = channel.power(covariance_part, present) + channel.spread(mean_part, present)
@@ -116,7 +117,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     explained = decorrelate(factors.matrix, jnp.where(used, signal.cross.T, 0.0)).T
     share = reciprocal_or_zero(factors.weights)
     # The best beta, then the update with what is left of Omega as noise.
-    cross = (slopes * prior.variances) @ prior.root.T
+    cross = (slopes * prior.variances) @ prior.root.T  # C', of what is received and the state
     parts = base + unit_variance_where_absent(present), shift, cross @ cross.T, jnp.sum(explained**2 @ share)
     beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, parts)[0]
     noise = factor_spread(base + shift / beta - of_state)

@@ -153,13 +153,17 @@ class GivingInFilter(AbstractSizedFilter):
         return belief, _choose(gives_in, rival_innovation, innovation)
 
     def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
-        """Return whether a number has been refused for long enough in a row: often enough, or over enough time."""
-        long = jnp.zeros((), dtype=bool)
+        """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
+
+        `refused`: of each received number, its refusals in a row (m,); `elapsed`: time since the first of them.
+        """
+        is_long = jnp.zeros((), dtype=bool)
         if self.after is not None:
-            long = long | jnp.any(refused >= self.after)
+            is_long = is_long | jnp.any(refused >= self.after)
         if self.seconds is not None:
-            long = long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
-        return long
+            # One refusal alone, after which nothing came, is an outlier however long ago it was.
+            is_long = is_long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
+        return is_long
 
     def _widen_prior(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
         """Return the rival's prior, widened so that the gate's rule lets it use the numbers (m,) that were `left_out`.

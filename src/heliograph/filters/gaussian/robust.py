@@ -150,13 +150,13 @@ class StudentVB(AbstractWeights):
 
         w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1.
         """
-        scale = noise.diagonal
-        used = w = jnp.broadcast_to(jnp.ones_like(scale), e.shape)
+        variance = noise.diagonal
+        used = following = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
         for _ in range(self.iterations):
-            used = w
+            used = following
             residual = expected_squared_residuals(before, reweight(noise, used), e, present)
-            w = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / scale)
-        return used, w
+            following = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / variance)
+        return used, following
 
 
 class RobustFilter(AbstractBeliefFilter):

@@ -94,7 +94,7 @@ def signal_of(
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
     size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
-    return Signal(prior, mean, image.slopes, noise, second, size)
+    return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=noise, second=second, size=size)
 
 
 def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:

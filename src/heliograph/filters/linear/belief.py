@@ -31,7 +31,10 @@ class PlantMotion(NamedTuple):
 def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> PlantMotion:
     """Return the plant's motion under the input u; `start` is E[x_i^2] before the first step, (n,)."""
     return PlantMotion(
-        plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u), process_noise(plant, u, start)
+        matrix=plant.transition_matrix(u),
+        shift=plant.shift(u),
+        covariance=plant.noise_covariance(u),
+        noise=process_noise(plant, u, start),
     )
 
 

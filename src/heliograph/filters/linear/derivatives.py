@@ -85,18 +85,24 @@ def differentiate_step(
     """
     z, u = row
     filter, present = make(x), ~jnp.isnan(z)
+    # For each free number the step's matrices, which are the same, and their derivatives.
     pairs = [jax.jvp(lambda x: find_model_matrices(make(x), u, k), (x,), (axis,)) for axis in np.eye(len(x))]
     # Behind a known gain no moment before data matters: those at the start stand for all.
     prior = filter.predict(filter.init()._replace(gaussian=before.gaussian), u, k)
     after, innovation = filter.correct(prior, z, k)
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
-    step = FilterStep(pairs[0][0], before.gaussian, prior.gaussian, value, covariance, present)
-    following, errors, spreads = zip(
-        *(step.differentiate(d, one) for (_, d), one in zip(pairs, before.slopes, strict=True)), strict=True
+    step = FilterStep(
+        matrices=pairs[0][0], before=before.gaussian, prior=prior.gaussian, e=value, S=covariance, present=present
+    )
+    slopes_after, slopes_of_e, slopes_of_S = zip(
+        *(step.differentiate_in_one_number(d, one) for (_, d), one in zip(pairs, before.slopes, strict=True)),
+        strict=True,
     )
     lost = jnp.any(jnp.isnan(after.gaussian.mean))
-    whole = DifferentiatedInnovation(value, covariance, jnp.stack(errors), jnp.stack(spreads), present, lost)
-    return EstimateWithDerivatives(after.gaussian, following), whole
+    innovation_with_slopes = DifferentiatedInnovation(
+        e=value, S=covariance, de=jnp.stack(slopes_of_e), ds=jnp.stack(slopes_of_S), present=present, lost=lost
+    )
+    return EstimateWithDerivatives(after.gaussian, slopes_after), innovation_with_slopes
 
 
 def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
@@ -104,12 +110,12 @@ def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
     return ModelMatrices(
-        plant.transition_matrix(u),
-        plant.shift(u),
-        plant.noise_covariance(u),
-        gain @ jnp.asarray(sensor.matrix),
-        gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset),
-        gain @ jnp.asarray(law.covariance) @ gain.T + channel.noise.covariance,
+        F=plant.transition_matrix(u),
+        b=plant.shift(u),
+        Q=plant.noise_covariance(u),
+        H=gain @ jnp.asarray(sensor.matrix),
+        c=gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset),
+        R=gain @ jnp.asarray(law.covariance) @ gain.T + channel.noise.covariance,
     )
 
 
@@ -132,7 +138,9 @@ class FilterStep(NamedTuple):
     S: jax.Array
     present: jax.Array
 
-    def differentiate(self, d: ModelMatrices, before: MomentSlopes) -> tuple[MomentSlopes, jax.Array, jax.Array]:
+    def differentiate_in_one_number(
+        self, d: ModelMatrices, before: MomentSlopes
+    ) -> tuple[MomentSlopes, jax.Array, jax.Array]:
         """Return the derivatives, in one free number, of the estimate after the step, and of e and S.
 
         A dash is the derivative; m- and P are the predicted mean and covariance, C = P H', K = C S^-1, w = S^-1 e:

@@ -150,7 +150,14 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     noise = law.given_signal(mean, diagonal(explained))
     second = explained + noise.covariance + jnp.outer(mean, mean)
     slopes = matrix @ state.gaussian.root
-    return Signal(state.gaussian, mean, slopes, noise.columns, symmetric(second), signal_size_at_start(sensor, start))
+    return Signal(
+        prior=state.gaussian,
+        mean=mean,
+        slopes=slopes,
+        noise=noise.columns,
+        second=symmetric(second),
+        size=signal_size_at_start(sensor, start),
+    )
 
 
 def correct_linear(

@@ -64,9 +64,15 @@ def _centre_plant(plant: AbstractPlant) -> LinearPlant:
     """Return the plant of x less its mean: without the means of its noise and of its start."""
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
-    n = len(plant.states)
-    noise, center = about_mean(plant.noise), np.zeros(n)
-    return LinearPlant(plant.matrix, noise, center, law, plant.input_matrix, plant.states, plant.inputs)
+    return LinearPlant(
+        matrix=plant.matrix,
+        noise=about_mean(plant.noise),
+        initial_mean=np.zeros(len(plant.states)),
+        initial_covariance=law,
+        input_matrix=plant.input_matrix,
+        states=plant.states,
+        inputs=plant.inputs,
+    )
 
 
 def _matrix_of(model: AbstractPlant | AbstractSensor) -> np.ndarray:

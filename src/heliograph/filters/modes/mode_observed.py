@@ -78,7 +78,9 @@ class ModeObservedFilter(AbstractSizedFilter):
             belief=belief,
             before=belief,
             z=jnp.full(first(self.channel).outputs, jnp.nan),
-            move=PlantMotion(jnp.eye(n), jnp.zeros(n), zeros, WeightedColumns(zeros, jnp.zeros(n))),
+            move=PlantMotion(
+                matrix=jnp.eye(n), shift=jnp.zeros(n), covariance=zeros, noise=WeightedColumns(zeros, jnp.zeros(n))
+            ),
             begun=jnp.asarray(False),
         )
 
@@ -121,21 +123,23 @@ class ModeObservedFilter(AbstractSizedFilter):
         belief = ModeObservedBelief(belief=after, before=prior, z=usable, move=state.move, begun=jnp.asarray(True))
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
-    def _redo_last_step(self, state: ModeObservedBelief, modes: jax.Array, k: Step) -> LinearBelief:
-        """Return the prior of step k after the last measurement is used again, under the modes that it came by."""
+    def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
+        """Return the prior of step k after the last measurement is used again, given the memories' states then."""
         last = jnp.maximum(jnp.asarray(k) - 1, 0)
-        channel = _condition_channel(at(self.channel, last), modes)
+        channel = _condition_channel(at(self.channel, last), memory_states)
         start = second_moments_at_start(self.plant)
         redone, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
         return predict_belief(redone, state.move)
 
-    def _describe_channel_after(self, begun: jax.Array, modes: jax.Array, k: Step) -> SecondOrder:
-        """Return the channel's moments at step k given the modes of the step before; at the first step without them."""
+    def _describe_channel_after(self, begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
+        """Return the channel's moments at step k given the memories' states one step before, at the first step without.
+
+        `begun`: whether there was a step before.
+        """
         channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
-        following = _predict_channel(at(self.channel, last), channel, modes)
-        described: SecondOrder = jax.tree.map(
-            lambda a, b: jnp.where(begun, a, b), following, _predict_channel(None, channel, modes)
-        )
+        following = _predict_channel(at(self.channel, last), channel, memory_states)
+        of_first_step = _predict_channel(None, channel, memory_states)
+        described: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), following, of_first_step)
         return described
 
     @estimates
@@ -172,8 +176,11 @@ def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
     """Return the mean and spread of the channel under the nominal law, for numbers that may be traced."""
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
-    none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
-    return describe_second_moments(mean, spread, none, none, spread, False)
+    # Bounds of an uncertain law are not used: their maps are zero.
+    zero_map = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
+    return describe_second_moments(
+        mean=mean, spread=spread, shift=zero_map, power=zero_map, nominal=spread, uncertain=False
+    )
 
 
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:

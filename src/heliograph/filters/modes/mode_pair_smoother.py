@@ -85,7 +85,7 @@ def move_pairs(
         predicted = from_columns(mean, join_columns(image.explained, rest))
         return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, rest))
 
-    # Each Gaussian by each plant, then for each mode by that of its plant.
+    # Each Gaussian moved by each plant, [i, plant]; then for each mode j the one by its plant, [i, j].
     by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
     pairs: MovedPairs = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, plant_of], *by_plant)
     return pairs

@@ -275,7 +275,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         prior, linearised = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, posterior))
         source: Gaussian = jax.tree.map(lambda a, b: jnp.where(from_prior, a, b), prior, linearised)
         d = condition_on_draw(source, draw).mean[: self.drawn]
-        # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d).
+        # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d). States
+        # that are known already have no density: they are `certain`, and left out of both.
         certain = find_certain(prior, d)
         rest, log_prior = condition_on_leading_states(prior, d, certain)
         log_linearised = log_posterior_mode[mode] + condition_on_leading_states(linearised, d, certain)[1]

@@ -85,7 +85,7 @@ def propose_particles(
         # The law of e given z, N(mean, (L L')^-1), by its precision L L' = I + C' R^-1 C, and a draw of it.
         scaled = jnp.linalg.solve(noise, columns)
         lower = jnp.linalg.cholesky(jnp.eye(len(center)) + columns.T @ scaled)
-        # As matrices, which are the same for all particles where the sensor is linear.
+        # As matrices rather than solves for each particle: of a linear sensor they are the same for all particles.
         kalman_gain = jax.scipy.linalg.cho_solve((lower, True), scaled.T)
         spread = jax.scipy.linalg.solve_triangular(lower.T, jnp.eye(len(center)), lower=False)
         mean = kalman_gain @ jnp.where(arrived, innovation, 0.0)
