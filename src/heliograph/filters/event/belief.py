@@ -35,4 +35,6 @@ class EventBelief(NamedTuple):
     @staticmethod
     def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """Return the state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
-        return EventBelief(jnp.exp(parts.log_weight), parts.gaussian, parts.label, begun, moved)
+        return EventBelief(
+            weight=jnp.exp(parts.log_weight), gaussian=parts.gaussian, label=parts.label, begun=begun, moved=moved
+        )

@@ -142,7 +142,7 @@ class EventFilter(AbstractSizedFilter):
             older = jnp.concatenate([jnp.zeros_like(label[..., :1, :]), label[..., :-1, :]], axis=-2)
             age, oldest = jnp.arange(self.ages)[:, None], self.trigger.heartbeat
             label = jnp.where(age <= oldest, older, 0.0) + jnp.where(age == oldest, label, 0.0)
-        return EventBelief(state.weight, both, label, state.begun, jnp.asarray(True))
+        return EventBelief(weight=state.weight, gaussian=both, label=label, begun=state.begun, moved=jnp.asarray(True))
 
     def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""

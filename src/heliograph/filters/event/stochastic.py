@@ -67,7 +67,9 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Return the prior."""
         start = at(self.plant, 0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
-        return StochasticBelief(x, jnp.asarray(self.initial), jnp.zeros(self.outputs), jnp.asarray(False))
+        return StochasticBelief(
+            gaussian=x, law=jnp.asarray(self.initial), reference=jnp.zeros(self.outputs), moved=jnp.asarray(False)
+        )
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
@@ -79,7 +81,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)
-        return StochasticBelief(moved, law, reference, jnp.asarray(True))
+        return StochasticBelief(gaussian=moved, law=law, reference=reference, moved=jnp.asarray(True))
 
     def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""

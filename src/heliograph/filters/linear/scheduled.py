@@ -73,7 +73,13 @@ class ScheduledFilter(AbstractSizedFilter):
     def init(self) -> ScheduleState:
         """Return the schedule's initial state."""
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
-        return ScheduleState(jnp.asarray(self.start), mean, expected, jnp.asarray(True), jnp.asarray(0))
+        return ScheduleState(
+            value=jnp.asarray(self.start),
+            mean=mean,
+            expected=expected,
+            complete=jnp.asarray(True),
+            stage=jnp.asarray(0),
+        )
 
     @predicts
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:

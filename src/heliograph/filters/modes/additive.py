@@ -88,7 +88,13 @@ class AdditiveModalFilter(AbstractModalFilter):
         parts = [spread, *(jnp.kron(_indicator_covariance(law), second) for law in laws if len(law) > 1)]
         centre = jnp.asarray(start.initial_mean)
         mean = self._embed_first_block(jnp.append(centre, 1.0))
-        return AdditiveBelief(from_covariance(mean, block_diag(*parts)), second, laws, centre, jnp.asarray(False))
+        return AdditiveBelief(
+            gaussian=from_covariance(mean, block_diag(*parts)),
+            second=second,
+            laws=laws,
+            centre=centre,
+            moved=jnp.asarray(False),
+        )
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
@@ -102,7 +108,9 @@ class AdditiveModalFilter(AbstractModalFilter):
         root, noise_of_zeta = self._transition_factors(state, u, k)
         after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise_of_zeta))
         second = move @ state.second @ move.T + noise
-        return AdditiveBelief(after, second, _next_laws(state.laws, rows), centre, jnp.asarray(True))
+        return AdditiveBelief(
+            gaussian=after, second=second, laws=_next_laws(state.laws, rows), centre=centre, moved=jnp.asarray(True)
+        )
 
     @corrects
     def correct(self, state: AdditiveBelief, z: ArrayLike, k: Step = 0) -> tuple[AdditiveBelief, Innovation]:

@@ -120,7 +120,7 @@ class MixtureFilter(AbstractSizedFilter):
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
-        return MixtureBelief(prior, jnp.asarray(self.initial), jnp.asarray(False))
+        return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
@@ -129,7 +129,7 @@ class MixtureFilter(AbstractSizedFilter):
         noise = process_noise(plant, u, second_moments_at_start(self.plant))
         moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
-        return MixtureBelief(moved, law, jnp.asarray(True))
+        return MixtureBelief(gaussian=moved, law=law, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:

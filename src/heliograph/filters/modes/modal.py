@@ -168,7 +168,7 @@ class ModalFilter(AbstractJointModalFilter):
         """Return the prior, independent of the mode."""
         law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
         moments, centre = law[:, None, None] * second, jnp.asarray(at(self.plant, 0).initial_mean)
-        return ModalBelief(prior, moments, centre, jnp.asarray(False))
+        return ModalBelief(gaussian=prior, moments=moments, centre=centre, moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
@@ -185,7 +185,7 @@ class ModalFilter(AbstractJointModalFilter):
         root, noise = self._transition_factors(state, u, k)
         after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise))
         moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
-        return ModalBelief(after, moments, motion.centre, jnp.asarray(True))
+        return ModalBelief(gaussian=after, moments=moments, centre=motion.centre, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:

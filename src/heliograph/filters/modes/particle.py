@@ -101,7 +101,13 @@ class ParticleFilter(AbstractSizedFilter):
         start, n = at(self.plant, 0), self.particles
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
-        return Particles(parts, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
+        return Particles(
+            gaussian=parts,
+            mode=mode,
+            weight=jnp.full(n, 1 / n),
+            key=jax.random.PRNGKey(self.seed),
+            moved=jnp.asarray(False),
+        )
 
     @predicts
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
@@ -114,7 +120,7 @@ class ParticleFilter(AbstractSizedFilter):
         parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
         mode = jnp.where(state.moved, drawn, state.mode)
         parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
-        return Particles(parts, mode, state.weight, key, jnp.asarray(True))
+        return Particles(gaussian=parts, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
@@ -133,7 +139,7 @@ class ParticleFilter(AbstractSizedFilter):
         indices = jnp.where(too_few, resampled, jnp.arange(self.particles))
         weight = jnp.where(too_few, 1 / self.particles, weight)
         kept: Gaussian = jax.tree.map(lambda leaf: leaf[indices], after)
-        return Particles(kept, state.mode[indices], weight, key, state.moved), mixed
+        return Particles(gaussian=kept, mode=state.mode[indices], weight=weight, key=key, moved=state.moved), mixed
 
     @estimates
     def estimate(self, state: Particles) -> Estimate:

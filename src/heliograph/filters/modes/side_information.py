@@ -230,7 +230,9 @@ def _make_belief(
 ) -> SideInformationBelief:
     """Build the state from the triangular factors of each mode's moments (M, q, q)."""
     lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
-    return SideInformationBelief(mean, lower, jnp.asarray(moments.weights), centre, moved)
+    return SideInformationBelief(
+        mean=mean, lower=lower, variances=jnp.asarray(moments.weights), centre=centre, moved=moved
+    )
 
 
 def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:

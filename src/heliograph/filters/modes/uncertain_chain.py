@@ -68,7 +68,9 @@ class UncertainModalFilter(AbstractJointModalFilter):
         """Return the prior, independent of the mode, whose initial law is known."""
         law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
         centre = jnp.asarray(at(self.plant, 0).initial_mean)
-        return UncertainBelief(prior, second, centre, law, law, law, jnp.asarray(False))
+        return UncertainBelief(
+            gaussian=prior, second=second, centre=centre, law=law, low=law, high=law, moved=jnp.asarray(False)
+        )
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
@@ -81,7 +83,9 @@ class UncertainModalFilter(AbstractJointModalFilter):
         after = from_columns(mean, join_columns(WeightedColumns(root, (1 + young) * x.variances), fresh))
         # E[x~ x~'] and nominal law one step later.
         second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
-        return UncertainBelief(after, second, centre, law, low, high, jnp.asarray(True))
+        return UncertainBelief(
+            gaussian=after, second=second, centre=centre, law=law, low=low, high=high, moved=jnp.asarray(True)
+        )
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
         """Return the modes' transition matrix and the radius of its entries; before the first prediction I and 0."""

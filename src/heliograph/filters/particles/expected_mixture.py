@@ -49,7 +49,13 @@ def sum_mixtures(
     value = jnp.where(valid[..., None], value, 0.0).reshape(-1, m)
     total = jnp.where(valid[..., None, None], predicted.total, 0.0).reshape(-1, m, m)
     spread = (value * share[:, None]).T @ value + jnp.einsum("a,aij->ij", share, total)
-    return ReceivedSums(jnp.sum(share), share @ value, spread, jnp.sum(weight), weight @ predicted.chance)
+    return ReceivedSums(
+        weight=jnp.sum(share),
+        value=share @ value,
+        spread=spread,
+        of_all=jnp.sum(weight),
+        chance=weight @ predicted.chance,
+    )
 
 
 def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:

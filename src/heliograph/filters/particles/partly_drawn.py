@@ -353,7 +353,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         share = jax.nn.softmax(log_mode)[:, None] * received.weight
         m = len(received.z)
         chance = jnp.sum(jnp.exp(log_mode))
-        return ExpectedMixture(share.ravel(), expected.reshape(-1, m), total.reshape(-1, m, m), chance)
+        return ExpectedMixture(
+            share=share.ravel(), expected=expected.reshape(-1, m), total=total.reshape(-1, m, m), chance=chance
+        )
 
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step

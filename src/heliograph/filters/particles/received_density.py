@@ -154,4 +154,4 @@ def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
     """Stack atoms into arrays of `count`, the missing ones of weight zero."""
     filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
     weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
-    return ReceivedAtoms(weight / weight.sum(), gain, offset, noise)
+    return ReceivedAtoms(weight=weight / weight.sum(), gain=gain, offset=offset, noise=noise)

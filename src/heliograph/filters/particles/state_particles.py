@@ -91,7 +91,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
         size = position.shape[1]
         law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
-        return StateParticles(position, log_weight, law, key, jnp.asarray(True))
+        return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def start_keys(self) -> tuple[jax.Array, jax.Array]:
         """Return the key of the first step, and that of the draws of x_0."""
@@ -110,7 +110,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         key, choice, own = self.keys_of_prediction(state.key)
         which, log_weight = self.resampled(state.log_weight, choice)
         position, law = self.move(state.position[which], None, own, jnp.asarray(u), k, state.moved)
-        return StateParticles(position, log_weight, law, key, jnp.asarray(True))
+        return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def keys_of_prediction(self, key: jax.Array) -> jax.Array:
         """Return keys of what follows, of the choice of particles, and of their noise (3, 2)."""

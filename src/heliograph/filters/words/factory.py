@@ -49,10 +49,10 @@ def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
             expected = "one without resolution, as words have their own"
             raise fail("sensor of a node with an encoder", expected, "a resolution")
         low, step, centre = (encoder.each(end, m) for end in (encoder.low, encoder.step, encoder.centre))
-        return WordAlphabet(low, step, centre, encoder.bits, encoder.dither)
+        return WordAlphabet(low=low, step=step, centre=centre, bits=encoder.bits, dither=encoder.dither)
     if not isinstance(sensor.noise, RoundedNoise):
         raise fail("word filter", "an encoder (Words), or a sensor with a resolution", "neither")
-    return WordAlphabet(np.zeros(m), np.asarray(sensor.noise.step), np.zeros(m), 0, "none")
+    return WordAlphabet(low=np.zeros(m), step=np.asarray(sensor.noise.step), centre=np.zeros(m), bits=0, dither="none")
 
 
 def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:

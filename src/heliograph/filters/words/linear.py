@@ -153,7 +153,15 @@ def _round_sensor(sensor: LinearSensor, encoder: Words, gaussian: bool, matters:
     """Return the sensor of y - c whose noise has the error of rounding."""
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
-    noise = RoundedNoise(sensor.noise, step, high - centre, centre, encoder.dither, gaussian, matters)
+    noise = RoundedNoise(
+        source=sensor.noise,
+        step=step,
+        half=high - centre,
+        centre=centre,
+        dither=encoder.dither,
+        gaussian=gaussian,
+        matters=matters,
+    )
     return LinearSensor(sensor.matrix, noise, sensor.outputs)
 
 

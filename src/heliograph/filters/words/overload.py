@@ -156,7 +156,14 @@ def _describe_step(motion: Motion, senses: Motion, link: SecondOrder, signal: tu
     spread = np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
     columns = np.asarray(link.noise.matrix)
     noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
-    return Steps(a, b, q, gain @ c, gain @ shift + np.asarray(link.offset), noise + spread)
+    return Steps(
+        transition=a,
+        drift=b,
+        process=q,
+        output=gain @ c,
+        offset=gain @ shift + np.asarray(link.offset),
+        noise=noise + spread,
+    )
 
 
 def _count_beyond(

@@ -86,13 +86,15 @@ class ClockFilter(AbstractWrapper):
         # No component counts before it arrives, as after n steps of silence; and no clock has been observed.
         silence = jnp.full(self.received, len(self.states))
         observed = jnp.zeros(len(self.offsets), dtype=bool)
-        return ClockBelief(start, jnp.zeros(len(self.inputs)), silence, observed)
+        return ClockBelief(gaussian=start, inputs=jnp.zeros(len(self.inputs)), silence=silence, observed=observed)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
         """Predict plant and clocks over step k."""
         moved = self.base.predict(state.gaussian, u, k)
-        return ClockBelief(moved, jnp.asarray(u, dtype=float), state.silence + 1, state.observed)
+        return ClockBelief(
+            gaussian=moved, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
+        )
 
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
@@ -115,7 +117,7 @@ class ClockFilter(AbstractWrapper):
         gain = gain * self._mask_estimated(observed)[:, None]
         slopes, noise = jnp.asarray(channel.mean_gain) @ signal.slopes, make_received_noise(signal, channel)
         after = correct_by_gain(prior, slopes, noise, gain, jnp.where(present, z - expected, 0.0))
-        belief = ClockBelief(after, state.inputs, silence, observed)
+        belief = ClockBelief(gaussian=after, inputs=state.inputs, silence=silence, observed=observed)
         return belief, gaussian_innovation(z, expected, total)
 
     def _mask_estimated(self, observed: jax.Array) -> jax.Array:

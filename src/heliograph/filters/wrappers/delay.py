@@ -127,7 +127,7 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, start: int, lengt
     noise = WeightedColumns(
         jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights
     )
-    return predict_belief(state, PlantMotion(matrix, shift, noise.covariance, noise))
+    return predict_belief(state, PlantMotion(matrix=matrix, shift=shift, covariance=noise.covariance, noise=noise))
 
 
 def enlarge_by_relays(
