@@ -81,8 +81,8 @@ def sum_rows(
 
     numbers = number_rows(rows, first)
     shapes = jax.eval_shape(lambda: step(state, jax.tree.map(lambda leaf: leaf[0], rows), numbers[0])[1])
-    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return jax.lax.scan(body, (state, none), (rows, numbers))[0]
+    zero_sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return jax.lax.scan(body, (state, zero_sums), (rows, numbers))[0]
 
 
 def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:

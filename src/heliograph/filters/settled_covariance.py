@@ -68,7 +68,7 @@ class SettledState(NamedTuple):
         """Test which states (n, ...) are this one but for the means."""
         means = means_of(states)
         beside, own = (jax.tree.leaves(with_means(x, [()] * len(means))) for x in (states, self.state))
-        # Most have the same numbers; of the others what these stand for is compared.
+        # Most have the same numbers. The others may have others for the same covariance, which are compared by it.
         same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(beside, own, strict=True)]
         covered: np.ndarray = np.all(same, axis=0)
         others = np.flatnonzero(~covered)
@@ -91,7 +91,7 @@ def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead:
     if varies is None:
         return None
     arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
-    choice = choose_code(_settle, arguments, [False] * len(arguments))
+    choice = choose_code(_repeat_row_over_windows, arguments, [False] * len(arguments))
     return None if choice.code is None else find_unchanged_state(varies, *choice.results())
 
 
@@ -114,7 +114,7 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
     return SettledState(state, last_outputs, varies)
 
 
-def _settle(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
+def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, numbers: Array) -> tuple[PyTree, PyTree]:
     """Repeat a row over two windows of numbers (2, rows): states, and what is kept of each one's last row (2, ...)."""
     AfterRow = tuple[PyTree, PyTree]  # a state, and what is kept of the row before it
 

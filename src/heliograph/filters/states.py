@@ -36,7 +36,8 @@ def find_equal_states(
     deviations of their Gaussian as well, and as shares of the largest such derivative in the same number: of those
     `among` which they are, or of the others.
     """
-    # (number, other number, allowed difference besides roundings)
+    # (number, other number, allowed difference besides roundings); the derivatives of a Gaussian come after it, and are
+    # measured by its deviations.
     pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
     sizes = _size_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):

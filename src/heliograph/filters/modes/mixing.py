@@ -27,11 +27,11 @@ class AbstractMerging(Module):
         """True if what was moved is merged after its correction alone, pair by pair of modes."""
         return False
 
-    def start(self, law: jax.Array) -> jax.Array:
+    def initial_weights(self, law: jax.Array) -> jax.Array:
         """Return the weights (K, M) of the components before any data, of the modes' law (M,)."""
         return jnp.diag(law)
 
-    def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each mode, of components and weights (K, M) as `keep_components` returns them."""
         return parts
 
@@ -42,12 +42,12 @@ class AbstractMerging(Module):
         """
         raise unwritten(self, "mixing")
 
-    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return for each component after the prediction which mixture it was before, and which mode moved it."""
         places = np.arange(modes)
         return places, places
 
-    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs (component, mode) of the measurement update: all that can have a weight."""
         places = np.arange(modes)
         return places, places
@@ -64,7 +64,7 @@ class MergeAll(AbstractMerging):
         """Return weights (K, 1) of one mixture of all, and (M, M) of its copies in the modes after the move."""
         return jnp.sum(weight, axis=1, keepdims=True), jnp.diag(jnp.sum(weight @ rows, axis=0))
 
-    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return which mixture each predicted component was and which mode moved it: each mode moves one."""
         return np.zeros(modes, int), np.arange(modes)
 
@@ -90,13 +90,13 @@ class MergeByMode(AbstractMerging):
         """Return weights (K, M) that mix each mode's component alone, and the joint probabilities after the move."""
         return weight, jnp.sum(weight, axis=0)[:, None] * rows
 
-    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs (component, mode) of the update: every component with every mode."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode, merged over the modes before, and the weights (M, M)."""
-        pairs = weight[:, None] * (self.update_pairs(modes)[1][:, None] == np.arange(modes))
+        pairs = weight[:, None] * (self.list_update_pairs(modes)[1][:, None] == np.arange(modes))
         merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs))
         return merged, jnp.diag(jnp.sum(pairs, axis=0))
 
@@ -109,11 +109,11 @@ class MergePairs(AbstractMerging):
         """Always True."""
         return True
 
-    def by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
+    def merge_by_mode(self, parts: Gaussian, weight: jax.Array) -> Gaussian:
         """Return one Gaussian for each present mode, merged from its pairs."""
         return jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight))
 
-    def start(self, law: jax.Array) -> jax.Array:
+    def initial_weights(self, law: jax.Array) -> jax.Array:
         """Return the weights (M^2, M) of pairs before any data: the law (M,) on pairs of equal modes."""
         modes = len(law)
         return self._by_mode(jnp.eye(modes).reshape(-1) * jnp.repeat(law, modes), modes)
@@ -123,11 +123,11 @@ class MergePairs(AbstractMerging):
         modes = len(rows)
         return weight, self._by_mode((jnp.sum(weight, axis=0)[:, None] * rows).reshape(-1), modes)
 
-    def moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_moves(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return which mixture each predicted component was and which mode moved it: each mode moves all."""
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
-    def update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    def list_update_pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs (component, mode) of the update: each component, a pair of modes, with its present mode."""
         return np.arange(modes**2), np.tile(np.arange(modes), modes)
 

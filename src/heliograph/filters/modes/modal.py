@@ -166,8 +166,9 @@ class ModalFilter(AbstractJointModalFilter):
     @compile_on_call
     def init(self) -> ModalBelief:
         """Return the prior, independent of the mode."""
-        law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
-        moments, centre = law[:, None, None] * second, jnp.asarray(at(self.plant, 0).initial_mean)
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        prior, second = compute_initial_moments(start, self.initial)
+        moments, centre = law[:, None, None] * second, jnp.asarray(start.initial_mean)
         return ModalBelief(gaussian=prior, moments=moments, centre=centre, moved=jnp.asarray(False))
 
     @predicts

@@ -160,7 +160,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes."""
-        start, weight = at(self.plant, 0), self.merging.start(jnp.asarray(self.initial))
+        start, weight = at(self.plant, 0), self.merging.initial_weights(jnp.asarray(self.initial))
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
         return ModalBeliefs(parts, weight, jnp.asarray(False))
 
@@ -170,9 +170,15 @@ class MultipleModelFilter(AbstractSizedFilter):
         plants, u, modes = models_of(at(self.plant, k)), jnp.asarray(u), len(self.initial)
         mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, u, k))
         parts = move_by_law(
-            plants, np.array(self.plant_modes), self.transform, state.gaussian, mixing, self.merging.moves(modes), u,
-            second_moments_at_start(self.plant),
-        )  # fmt: skip
+            plants=plants,
+            plant_of=np.array(self.plant_modes),
+            transform=self.transform,
+            parts=state.gaussian,
+            weight=mixing,
+            moves=self.merging.list_moves(modes),
+            u=u,
+            start=second_moments_at_start(self.plant),
+        )
         parts = parts._replace(mean=align_angles(plants[0], parts.mean, jnp.sum(weight, axis=1)))
         return ModalBeliefs(parts, weight, jnp.asarray(True))
 
@@ -185,7 +191,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood."""
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
-        _, j = self.merging.update_pairs(modes)
+        _, j = self.merging.list_update_pairs(modes)
         (signal, weights), plant = self.prior_signals(state, k), models_of(at(self.plant, k))[0]
         after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
         parts = after._replace(mean=align_angles(plant, after.mean, weight))
@@ -193,10 +199,10 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
         """Return the signal of each pair (component, mode) that is corrected, and its weight before."""
-        i, j = self.merging.update_pairs(len(self.initial))
-        return self.signals(state.gaussian, (i, j), k), state.weight[i, j]
+        i, j = self.merging.list_update_pairs(len(self.initial))
+        return self.signals_of_pairs(state.gaussian, (i, j), k), state.weight[i, j]
 
-    def signals(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
+    def signals_of_pairs(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
         """Return the signal of each pair (component, mode): of the mode's sensor under the component's prior."""
         plant, sensors = models_of(at(self.plant, k))[0], models_of(at(self.sensor, k))
         (component, mode), start = pairs, second_moments_at_start(self.plant)
@@ -211,8 +217,10 @@ class MultipleModelFilter(AbstractSizedFilter):
             results.append(jax.tree.map(lambda leaf, index=index: leaf[index], signals))
         if len(results) == 1:
             return results[0]
-        order = np.argsort(np.concatenate([np.flatnonzero(sensor_of_pair == number) for number in range(len(sensors))]))
-        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *results)
+        # The place of each pair among the results: the inverse of the permutation in which these are listed.
+        listed = np.concatenate([np.flatnonzero(sensor_of_pair == number) for number in range(len(sensors))])
+        place = np.argsort(listed)
+        joined: Signal = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[place], *results)
         return joined
 
     @estimates
@@ -239,7 +247,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
         """Return the law of a state after a correction, mode by mode."""
-        return ModalLaw(self.merging.by_mode(state.gaussian, state.weight), state.law)
+        return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> tuple[Gaussian, Gaussian, jax.Array, BackwardGain]:
         """Return what a smoother by pairs needs: Gaussians by mode, pairs (M^2, n), their weights, and the ways back.
@@ -259,7 +267,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         if not self.merging.corrects_pairs:
             return known, pairs, weights, moved.back
         j = np.tile(np.arange(modes), modes)
-        signal = self.signals(pairs, (np.arange(modes**2), j), k)
+        signal = self.signals_of_pairs(pairs, (np.arange(modes**2), j), k)
         pairs, weight, _ = correct_in_every_mode(
             signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), jnp.asarray(step.z), self.observed_angles
         )

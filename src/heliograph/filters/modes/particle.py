@@ -167,15 +167,18 @@ def particle_filter(
 ) -> "AnyParticleFilter":
     """Return a particle filter: of the state, of named states, or of the modes of links with memory (Rao-Blackwell).
 
-    Of the state: N points with weights, for any plant, and any sensor and link without memory whose noise has a
-    density: x_i is drawn from a proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i). Of the
-    states named `drawn`: given these (and a mode) the others are Gaussian, exactly, and each particle carries their
-    Kalman filter; p is then the density with the others integrated out. Of a `markov_plant`, a `markov_sensor` and
-    links with them, each particle draws the joint mode too, from its law given z, all modes summed. Of links' modes
-    alone: each particle draws a path of modes and carries the Gaussian filter of that path. Systematic resampling
-    where the effective number 1 / sum w_i^2 is below a share of N, of the state at the start of the next step, so that
-    an estimate has all weights. A row that no particle can explain is not used: its log-likelihood is -inf. Error of
-    the mixture's moments: in proportion to 1 / root of `particles`.
+    What each of the N particles draws:
+
+    - the state, for any plant, and any sensor and link without memory whose noise has a density. x_i is drawn from a
+      proposal q, and its weight multiplied by p(z | x_i) p(x_i | before) / q(x_i);
+    - the states named `drawn`. Given these (and a mode) the others are Gaussian, exactly, and the particle carries
+      their Kalman filter; p is then the density with the others integrated out;
+    - the joint mode too, of a `markov_plant`, a `markov_sensor` and links with them, from its law given z;
+    - of links with memory alone a path of modes; the particle carries the Gaussian filter of that path.
+
+    Particles are resampled systematically where the effective number 1 / sum w_i^2 is below a share of N; where states
+    are drawn at the start of the next step, so that an estimate has all weights. A row that no particle can explain is
+    not used: its log-likelihood is -inf. The error of the mixture's moments is in proportion to 1 / root of N.
 
     Args:
         plant: the plant, n states.

@@ -66,8 +66,9 @@ class UncertainModalFilter(AbstractJointModalFilter):
     @compile_on_call
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known."""
-        law, (prior, second) = jnp.asarray(self.initial), compute_initial_moments(at(self.plant, 0), self.initial)
-        centre = jnp.asarray(at(self.plant, 0).initial_mean)
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        prior, second = compute_initial_moments(start, self.initial)
+        centre = jnp.asarray(start.initial_mean)
         return UncertainBelief(
             gaussian=prior, second=second, centre=centre, law=law, low=law, high=law, moved=jnp.asarray(False)
         )

@@ -123,7 +123,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """True: a value of likelihood 0 under every particle is excluded by its model."""
         return True
 
-    def resampled(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
+    def choose_particles(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
         """Resample systematically where the effective number is too small; else all particles go on as they are."""
         weight = jax.nn.softmax(log_weight)
         too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles

@@ -31,7 +31,7 @@ class ExpectedMeasurement(NamedTuple):
         value = self.z - self.atoms.expected(jnp.nan_to_num(self.reference, nan=0.0, posinf=0.0, neginf=0.0))[0]
         return wrap_near(value, jnp.zeros(len(self.z)), self.angles)
 
-    def apart(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def find_innovations(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return weights (B a,) of particles and atoms, and how far their innovations are from the base (B a, m).
 
         Args:

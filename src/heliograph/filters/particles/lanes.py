@@ -48,7 +48,7 @@ class ParticleGroup(NamedTuple):
 
 
 class ParticleSums(NamedTuple):
-    """Sums over the particles of a row: of states and of what is received as `_pack` makes them, `second` (n, n).
+    """Sums over the particles of a row: of states and of what is received as `_pack_sums` makes them, `second` (n, n).
 
     `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
     """
@@ -198,11 +198,11 @@ def _advance_particle(
     """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
     numbers = jnp.asarray(number)[None]
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
-    moved, law = filter.move(one, numbers, row.noise_key, row.u, row.k, row.moved)
-    weighed = filter.weigh(moved, law, numbers, row.proposal_key, row.z, row.k)
+    moved, law = filter.move_particles(one, numbers, row.noise_key, row.u, row.k, row.moved)
+    weighed = filter.weigh_particles(moved, law, numbers, row.proposal_key, row.z, row.k)
     likelihood = jnp.where(used, weighed.log_likelihood[0], 0.0)
-    told = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
-    return _take_first(told), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
+    after = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
+    return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
 def _sum_first(
@@ -211,7 +211,7 @@ def _sum_first(
     """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
-    return _pack(filter.sum_states(group.weight, group.particles)), _pack(received)
+    return _pack_sums(filter.sum_states(group.weight, group.particles)), _pack_sums(received)
 
 
 def _sum_second(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
@@ -233,13 +233,13 @@ def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple
     return estimate.mean, estimate.covariance, innovation, estimate.modes, count
 
 
-def _pack(sums: PyTree) -> jax.Array:
+def _pack_sums(sums: PyTree) -> jax.Array:
     """Return sums as one vector."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
 
 
 def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
-    """Return the sums that `_pack` made one vector of, like those of a function of these arguments."""
+    """Return the sums that `_pack_sums` made one vector of, like those of a function of these arguments."""
     leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
     parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
@@ -270,9 +270,9 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         draw = _bind(_draw_start, filter, (start_key, numbers), (False, True))
         if draw is None:
             return None
-        loop.begin(draw(start_key, numbers), np.zeros(filter.particles))
+        loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
     else:
-        loop.begin(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
+        loop.set_particles(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
     # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
     steps = [
         loop.filter_row(DataRow(*row), choice_start)
@@ -324,7 +324,7 @@ class _ParticleLoop:
         self.held = jax.tree.leaves(self.now)
         self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
 
-    def begin(self, particles: PyTree, log_weight: np.ndarray) -> None:
+    def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
         """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
         memory, count = self.memory, self.count
         for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):

@@ -121,9 +121,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
         """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
         key, choice, own = self.keys_of_prediction(state.key)
-        which, log_weight = self.resampled(state.log_weight, choice)
+        which, log_weight = self.choose_particles(state.log_weight, choice)
         particles = jax.tree.map(lambda leaf: leaf[which], self.particles_of(state))
-        moved, _ = self.move(particles, None, own, jnp.asarray(u), k, state.moved)
+        moved, _ = self.move_particles(particles, None, own, jnp.asarray(u), k, state.moved)
         return self.state_of(moved, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -131,7 +131,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         keys = jax.random.split(jax.random.fold_in(key, 0), 4)
         return keys[0], keys[1], keys[2:]
 
-    def move(
+    def move_particles(
         self, particles: Cloud, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[Cloud, None]:
         """Move the Gaussians of particles (B,) by the law of every mode that may follow."""
@@ -183,7 +183,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
-        weighed = self.weigh(self.particles_of(state), None, None, proposing, z, k)
+        weighed = self.weigh_particles(self.particles_of(state), None, None, proposing, z, k)
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         # All weights zero: the row is not used.
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
@@ -197,7 +197,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         key = fold_in_bits(key, z)
         return key, jax.random.split(jax.random.fold_in(key, 2))
 
-    def weigh(
+    def weigh_particles(
         self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
         """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
@@ -213,7 +213,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         plant, modes = models_of(at(self.plant, k))[0], len(self.initial)
         x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
         certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
-        predicted = jax.vmap(partial(self._expect, sensors, received))(gaussian, log_mode)
+        predicted = jax.vmap(partial(self._expect_received, sensors, received))(gaussian, log_mode)
         return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
     def _describe_received(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
@@ -334,7 +334,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         atom = draw_index(densities[None], uniform[None])[0]
         return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
 
-    def _expect(
+    def _expect_received(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, x: Gaussian, log_mode: jax.Array
     ) -> ExpectedMixture:
         """Return what a particle expects of z in each mode and atom, to first order in h."""
@@ -382,7 +382,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
-        back, weight = np.argsort(self.order), sums.first.weight
+        back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
         mean = sums.first.mean(self._angles_in_order(models_of(first(self.plant))[0]))
         modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
         return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)

@@ -108,15 +108,15 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
         """Resample where the effective number is too small, then move each particle with a noise of its own."""
         key, choice, own = self.keys_of_prediction(state.key)
-        which, log_weight = self.resampled(state.log_weight, choice)
-        position, law = self.move(state.position[which], None, own, jnp.asarray(u), k, state.moved)
+        which, log_weight = self.choose_particles(state.log_weight, choice)
+        position, law = self.move_particles(state.position[which], None, own, jnp.asarray(u), k, state.moved)
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def keys_of_prediction(self, key: jax.Array) -> jax.Array:
         """Return keys of what follows, of the choice of particles, and of their noise (3, 2)."""
         return jax.random.split(jax.random.fold_in(key, 0), 3)
 
-    def move(
+    def move_particles(
         self, x: jax.Array, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[jax.Array, MoveLaw | None]:
         """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it."""
@@ -150,7 +150,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z."""
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
-        weighed = self.weigh(state.position, state.law, None, proposing, z, k)
+        weighed = self.weigh_particles(state.position, state.law, None, proposing, z, k)
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
@@ -163,7 +163,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         key = fold_in_bits(key, z)
         return key, jax.random.fold_in(key, 2)
 
-    def weigh(
+    def weigh_particles(
         self, position: jax.Array, law: MoveLaw | None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
@@ -189,9 +189,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
         """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
-        both, apart = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).apart(
-            weight, *predicted
-        )
+        expected = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles)
+        both, apart = expected.find_innovations(weight, *predicted)
         return first_sums(both, apart, ()), second_sums(both, apart)
 
     def innovation_of(
@@ -203,9 +202,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density: jax.Array,
     ) -> Innovation:
         """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
-        return ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles).compute_innovation(
-            *received, density
-        )
+        first, second = received
+        expected = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles)
+        return expected.compute_innovation(first, second, density)
 
     def sum_states(self, weight: jax.Array, position: jax.Array) -> StateSums:
         """Return the first sums of positions (B, n)."""

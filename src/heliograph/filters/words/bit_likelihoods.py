@@ -40,7 +40,7 @@ class LinkOfBits(Module):
     weights: Float[np.ndarray, "modes combinations"]
     flag: int | None = eqx.field(static=True)
 
-    def weigh(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
+    def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
         """Return the probabilities of the combinations given what was told; all modes alike where nothing was."""
         weights = jnp.asarray(self.weights)
         if self.flag is None:
@@ -49,7 +49,7 @@ class LinkOfBits(Module):
         probabilities = jnp.where(jnp.isnan(mode), 1 / len(weights), mode == np.arange(len(weights)))
         return probabilities @ weights
 
-    def pairs(self, received: Pairs) -> list[Pairs]:
+    def find_sent_likelihoods(self, received: Pairs) -> list[Pairs]:
         """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
         return [infer_sent_bits(link, received) for link in self.links]
 

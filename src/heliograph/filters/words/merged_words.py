@@ -12,7 +12,7 @@ from heliograph.filters.words.word_sums import (
     SignalPrior,
     WordGrid,
     multiply_bits,
-    tabulate,
+    tabulate_likelihoods,
 )
 
 MERGED = 4  # bits of neighbouring cells whose likelihoods are those of the bits above times one table
@@ -99,7 +99,7 @@ def _sum_blocks(
         next_factor = next_factor * factor**2
     # Coefficients of the polynomials (cells of a block, 3): of likelihood, and times j and j^2.
     places = np.arange(2.0**MERGED)
-    table = tabulate(pairs[:MERGED]) * jnp.stack(bell)
+    table = tabulate_likelihoods(pairs[:MERGED]) * jnp.stack(bell)
     coefficients = jnp.stack([table, table * places, table * places**2], axis=1)
     bell_of_next_block = bell[-1] * next_factor  # e^(-(J w)^2 / (2 v))
     ratio_change = jnp.exp(-(2**MERGED) * width**2 / wide)  # of r, from block to block

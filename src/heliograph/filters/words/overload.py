@@ -24,9 +24,24 @@ from heliograph.random_affine.words.rounded import RoundedNoise
 STEPS = 500  # that are looked at, if the models do not end before
 MOST = 1e-3  # probability of an overload at a step that is not refused
 BEYOND = 40  # steps of words beyond the range that are counted
-Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
-Sensing = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+class Motion(NamedTuple):
+    """A plant over one step with inputs zero: x+ = matrix x + shift + w, `covariance` = Cov w."""
+
+    matrix: np.ndarray
+    shift: np.ndarray
+    covariance: np.ndarray
+
+
+class Sensing(NamedTuple):
+    """What is sent of x: y - c = matrix x + shift + v, `covariance` = Cov v, `rounding` that of the words' error."""
+
+    matrix: np.ndarray
+    shift: np.ndarray
+    covariance: np.ndarray
+    rounding: np.ndarray
 
 
 @readable
@@ -101,13 +116,13 @@ def _describe_system(
     x, spread = mean, covariance
     parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     for k in range(horizon):
-        (a, b, q), (c, shift, source, rounding), link = _read_step(plant, sensor, links, k)
-        x, spread = a @ x + b, a @ spread @ a.T + q
-        y, explained = c @ x + shift, c @ spread @ c.T
-        signals.append((y, np.diag(explained + source)))
+        motion, sensing, link = _read_step(plant, sensor, links, k)
+        x, spread = motion.matrix @ x + motion.shift, motion.matrix @ spread @ motion.matrix.T + motion.covariance
+        y, explained = sensing.matrix @ x + sensing.shift, sensing.matrix @ spread @ sensing.matrix.T
+        signals.append((y, np.diag(explained + sensing.covariance)))
         if link is not None:
-            second = explained + source + rounding + np.outer(y, y)
-            parts.append(_describe_step((a, b, q), (c, shift, source + rounding), link, (y, second)))
+            second = explained + sensing.covariance + sensing.rounding + np.outer(y, y)
+            parts.append(_describe_step(motion, sensing, link, y, second))
     stacked = Steps(*(np.array(field) for field in zip(*parts, strict=True))) if parts else None
     system = None if stacked is None else LinearSystem(stacked, mean, covariance, np.eye(len(mean)))
     return system, signals
@@ -122,15 +137,15 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
 def _read_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
-    """Return motion, sensor and link at a step; those of step 0 where nothing varies."""
-    return _motion(at(plant, k)), _sensing(at(sensor, k)), None if links is None else links[k]
+    """Return motion, sensing and link at a step; those of step 0 where nothing varies."""
+    return _read_motion(at(plant, k)), _read_sensing(at(sensor, k)), None if links is None else links[k]
 
 
 @cache_by_object
-def _motion(plant: LinearPlant) -> Motion:
+def _read_motion(plant: LinearPlant) -> Motion:
     """Return A, b and Cov w with inputs zero."""
-    a, b, q = _evaluate_motion(plant)
-    return np.asarray(a), np.asarray(b), np.asarray(q)
+    matrix, shift, covariance = _evaluate_motion(plant)
+    return Motion(matrix=np.asarray(matrix), shift=np.asarray(shift), covariance=np.asarray(covariance))
 
 
 @compile_on_call
@@ -141,27 +156,36 @@ def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
 
 
 @cache_by_object
-def _sensing(sensor: LinearSensor) -> Sensing:
+def _read_sensing(sensor: LinearSensor) -> Sensing:
     """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error."""
     law = sensor.noise
     assert isinstance(law, RoundedNoise)
     source = np.asarray(law.source.covariance)
-    return np.asarray(sensor.matrix), np.asarray(law.mean), source, np.asarray(law.covariance) - source
+    return Sensing(
+        matrix=np.asarray(sensor.matrix),
+        shift=np.asarray(law.mean),
+        covariance=source,
+        rounding=np.asarray(law.covariance) - source,
+    )
 
 
-def _describe_step(motion: Motion, senses: Motion, link: SecondOrder, signal: tuple[np.ndarray, np.ndarray]) -> Steps:
-    """Return one step with the random gain's part of the noise from the second moments of y."""
-    (a, b, q), (c, shift, covariance), (y, second) = motion, senses, signal
-    gain, moments = np.asarray(link.mean_gain), np.block([[second, y[:, None]], [y[None], np.ones((1, 1))]])
-    spread = np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
+def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np.ndarray, second: np.ndarray) -> Steps:
+    """Return one step of the linear system; a random gain acts as a noise, by the moments of what is sent.
+
+    `mean` (outputs,) and `second` (outputs, outputs): E and E[.. ..'] of y - c with the error of rounding.
+    """
+    # Second moments of (y - c, 1).
+    moments = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    gain, spread = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_spread), moments)
     columns = np.asarray(link.noise.matrix)
+    covariance = sensing.covariance + sensing.rounding
     noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
     return Steps(
-        transition=a,
-        drift=b,
-        process=q,
-        output=gain @ c,
-        offset=gain @ shift + np.asarray(link.offset),
+        transition=motion.matrix,
+        drift=motion.shift,
+        process=motion.covariance,
+        output=gain @ sensing.matrix,
+        offset=gain @ sensing.shift + np.asarray(link.offset),
         noise=noise + spread,
     )
 

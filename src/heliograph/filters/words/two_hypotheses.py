@@ -82,7 +82,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
         def append_measured(part: Gaussian) -> Gaussian:
             """Return the joint law of the state and what is measured, under one hypothesis."""
-            signal = base.measure(part, k)
+            signal = base.predict_signal(part, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
             return append_rows(part, signal.mean, signal.slopes, noise)
 
@@ -94,7 +94,9 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             begun = begun | words.present[i]
         total = jnp.where(words.are_words, total, -jnp.inf)
         after = joint._replace(parts=take_leading(joint.parts, n))
-        return after, base.compute_innovation(base.measure(_merge(state), k), words, z, at(base.numbers, k), total)
+        # The innovation is about what was expected by both hypotheses together, before the words.
+        signal = base.predict_signal(_merge(state), k)
+        return after, base.compute_innovation(signal, words, z, at(base.numbers, k), total)
 
     @estimates
     def estimate(self, state: Hypotheses) -> Estimate:

@@ -18,7 +18,7 @@ from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
 from heliograph.filters.words.bit_likelihoods import LinkOfBits
-from heliograph.filters.words.word_moments import WordEffect, effect_of_bits, effect_of_cell
+from heliograph.filters.words.word_moments import WordEffect, find_effect_of_bits, find_effect_of_cell
 from heliograph.filters.words.word_sums import SignalPrior, WordGrid
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at
@@ -68,7 +68,7 @@ class WordFilter(AbstractBeliefFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with the words that arrived, one component of y after another."""
         z, n = jnp.asarray(z), len(self.states)
-        signal = self.measure(state, k)
+        signal = self.predict_signal(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
         words = self.identify_received_words(z, at(self.links, k))
@@ -88,7 +88,7 @@ class WordFilter(AbstractBeliefFilter):
         """Always True: a number that is no word is excluded."""
         return True
 
-    def measure(self, state: Gaussian, k: Step) -> Signal:
+    def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of y before it is rounded."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
@@ -126,8 +126,8 @@ class WordFilter(AbstractBeliefFilter):
         if not self.certain:  # bits may flip
             bit = jnp.mod(jnp.floor(number[:, None] / 2.0 ** np.arange(self.bits)), 2.0)
             received_bits = jnp.stack([1 - bit, bit], axis=-1)
-            pairs = link.pairs(jnp.where(arrived[:, None, None], received_bits, 1.0))
-            weights = link.weigh(z[:outputs])
+            pairs = link.find_sent_likelihoods(jnp.where(arrived[:, None, None], received_bits, 1.0))
+            weights = link.find_probabilities(z[:outputs])
         return ReceivedWords(
             numbers=numbers,
             dithers=dithers,
@@ -164,15 +164,17 @@ class WordFilter(AbstractBeliefFilter):
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
-        return effect_of_bits(all_and_right, weights, words.numbers[i], self._word_grid(i, words), prior, self.dither)
+        return find_effect_of_bits(
+            all_and_right, weights, words.numbers[i], self._word_grid(i, words), prior, self.dither
+        )
 
     def _find_effect_of_word(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
         """Return what the received word of y_i says of it: log probability, shift of the mean, ratio of variances."""
         grid = self._word_grid(i, words)
         if self.certain:
-            return effect_of_cell(words.numbers[i], grid, prior, self.dither)
+            return find_effect_of_cell(words.numbers[i], grid, prior, self.dither)
         pairs = [pair[i] for pair in words.pairs]
-        return effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
+        return find_effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
     def _word_grid(self, i: int, words: "ReceivedWords") -> WordGrid:
         """Return the words of y_i as a grid: the lowest less the dither, the step, the bits."""

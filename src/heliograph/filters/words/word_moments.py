@@ -20,7 +20,7 @@ from heliograph.filters.words.word_sums import (
     SignalPrior,
     WordGrid,
     multiply_bits,
-    tabulate,
+    tabulate_likelihoods,
 )
 
 TABLE = 6  # bits of words that are all summed
@@ -28,6 +28,7 @@ BLOCK = 3  # bits of neighbouring words whose likelihoods are those of the bits 
 WINDOW = 10  # blocks of words that are at least so wide within the reach, the first of which may begin a block earlier
 FAR = 30.0  # deviations from which on differences of tails have no digits
 NARROW = 1e-3  # of a deviation: the density is linear over a cell of this half width
+BEYOND_ALL = 40.0  # deviations beyond which there is no probability
 LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed: less changes nothing
 
 
@@ -71,7 +72,7 @@ def sum_neighbours(
         prior: of y.
         dither: of the encoder.
     """
-    tables = jnp.stack([tabulate(pair[:BLOCK]) for pair in pairs])
+    tables = jnp.stack([tabulate_likelihoods(pair[:BLOCK]) for pair in pairs])
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
@@ -107,7 +108,7 @@ def sum_window(
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
 
-    Arguments are those of `effect_of_bits`.
+    Arguments are those of `find_effect_of_bits`.
     """
     count = WINDOW * 2**BLOCK
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
@@ -125,9 +126,9 @@ def sum_cell(
     """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere."""
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
-    if grid.bits:  # overloads: the end words have one edge
-        t = jnp.where(jnp.array([True, False]) & (index <= 0), -40.0, t)
-        t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), 40.0, t)
+    if grid.bits:  # overloads: the end words have one edge, the other one is BEYOND_ALL deviations away
+        t = jnp.where(jnp.array([True, False]) & (index <= 0), -BEYOND_ALL, t)
+        t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
     jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
     at_zero = likelihood * ((t[0] < 0) & (t[1] >= 0))
     return sum_by_edges(t, jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
@@ -160,7 +161,7 @@ def take_off_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
     return WordEffect(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
 
-def effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
+def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
     """Return what the word of number `index` does to y, where no bit can have flipped."""
     wider, wide = widen_by_dither(prior, grid, dither)
     cut = take_off_dither(_cut_to_cell(index, grid, wider), wide)
@@ -194,7 +195,7 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
     return WordEffect(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
 
 
-def effect_of_bits(
+def find_effect_of_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
     """Return what the received bits of a word do to y: log probability, shift of its mean, ratio of its variances.

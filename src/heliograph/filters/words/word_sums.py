@@ -51,7 +51,7 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
     return jnp.where(rest > 0, 0.0, likelihood)
 
 
-def tabulate(pair: jax.Array) -> jax.Array:
+def tabulate_likelihoods(pair: jax.Array) -> jax.Array:
     """Return the likelihoods of all words, the product of those of their bits (2^bits,)."""
     table = jnp.ones(1)
     for bit in range(len(pair)):

@@ -113,6 +113,7 @@ def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array)
             return prior, jnp.tensordot(weights, after, 1)
 
         priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(contexts.numbers), jnp.asarray(contexts.weights))
+        # V of each mode of the next step: the mean over the modes that may come before it.
         next_law = law @ contexts.transition
         back = law[:, None] * contexts.transition / jnp.where(next_law > 0, next_law, 1.0)  # P(i now | j next)
         mixed = jnp.einsum("ij,iab->jab", back, after)

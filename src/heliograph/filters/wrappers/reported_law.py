@@ -190,7 +190,8 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
     what is not drawn anew with each message.
     """
-    # The channel without what is told, and the filter for typical numbers, which predicts.
+    # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
+    # prediction depends on them.
     link = at_each_step(lambda channel: make_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
@@ -220,9 +221,11 @@ def believe_typical(link: PyTree) -> PyTree:
 
 
 def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take channels that tell of their links, by a `ToldFilter` of what it makes.
+    """Let a function that makes a filter take channels that report numbers of their law with each message.
 
-    To a type checker it returns what it makes: behind any other channel it does.
+    Behind such a channel the function then makes a `ToldFilter`, which reads the numbers (they are told) and corrects
+    with a filter of the law that they give. To a type checker the function returns what it returned before: behind any
+    other channel it does.
 
     Args:
         make: a function of a plant, a sensor, a channel, and more.
@@ -231,10 +234,13 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_with_told(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or one of told laws around it where the channel tells numbers."""
+        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
-        if not isinstance(first(channel), AbstractRandomAffine) or not separate_told(first(channel)).numbers:
+        # What is no channel reports nothing, and is for `make` to refuse.
+        is_channel = isinstance(first(channel), AbstractRandomAffine)
+        reports_numbers = is_channel and len(separate_told(first(channel)).numbers) > 0
+        if not reports_numbers:
             return make(*args, **kwargs)
         plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
         return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))

@@ -105,10 +105,11 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
     @wraps(make)
     def build_with_inputs(*args: P.args, **kwargs: P.kwargs) -> F:
         """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
-        # Without a sensor of inputs the filter is made as it is; what is no sensor is for `make` to refuse.
         given = parameters.bind(*args, **kwargs).arguments
         sensor = first(given.get("sensor"))
-        if not isinstance(sensor, AbstractSensor) or not sensor.inputs:
+        # What is no sensor has no inputs, and is for `make` to refuse.
+        depends_on_inputs = isinstance(sensor, AbstractSensor) and bool(sensor.inputs)
+        if not depends_on_inputs:
             return make(*args, **kwargs)
         plant, sensor = given.pop("plant"), given.pop("sensor")
 

@@ -75,10 +75,10 @@ class LimitedFilter(AbstractSizedFilter):
         """Correct the prediction, its mean held within the limits."""
         prior = state if _is_particles(state) else self._hold_means(state)
         after, innovation = self.base.correct(prior, z, k)
-        # log P(within | z) - log P(within); nothing where one of them is 0 to rounding.
+        # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_after, log_before = self._condition_with_mass(after)[0], self._condition_with_mass(state)[0]
-        both = jnp.isfinite(log_after) & jnp.isfinite(log_before)
-        change = jnp.where(both, log_after - log_before, 0.0)
+        are_possible = jnp.isfinite(log_after) & jnp.isfinite(log_before)
+        change = jnp.where(are_possible, log_after - log_before, 0.0)
         return after, replace(innovation, log_likelihood=innovation.log_likelihood + change)
 
     @estimates
@@ -185,11 +185,11 @@ class LimitedFilter(AbstractSizedFilter):
             mirrored = mirrored.at[:, place].set(jnp.clip(reflected, low, high))
         weight_within = jnp.where(inside, state.log_weight, -jnp.inf)
         log_mass = jax.nn.logsumexp(weight_within) - jax.nn.logsumexp(state.log_weight)
-        enough = jnp.sum(jnp.isfinite(weight_within)) > position.shape[1]
-        largest = jnp.where(enough, jnp.max(weight_within), 0.0)
+        enough_within = jnp.sum(jnp.isfinite(weight_within)) > position.shape[1]
+        largest = jnp.where(enough_within, jnp.max(weight_within), 0.0)
         return log_mass, state._replace(
-            log_weight=jnp.where(enough, weight_within - largest, state.log_weight),
-            position=jnp.where(enough, position, mirrored),
+            log_weight=jnp.where(enough_within, weight_within - largest, state.log_weight),
+            position=jnp.where(enough_within, position, mirrored),
         )
 
 
