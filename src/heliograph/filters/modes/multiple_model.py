@@ -136,6 +136,20 @@ class ModalBeliefs(NamedTuple):
 NODES = 3  # modes that stand for a gain that drifts
 
 
+class _DescribedPairs(NamedTuple):
+    """What a smoother by pairs (mode i before, mode j after) needs of a step of M modes.
+
+    `known`: the Gaussian of each mode j that the smoothed one is compared with, predicted, or filtered where pairs take
+    z before they are merged. `pairs` (M^2, n): those that observe what the future says; `weights` (M, M): their
+    probabilities; `ways`: smoother gains back.
+    """
+
+    known: Gaussian
+    pairs: Gaussian
+    weights: jax.Array
+    ways: BackwardGain
+
+
 class MultipleModelFilter(AbstractSizedFilter):
     """Filter of the state and of the mode of links with memory; built by `imm_filter`, `gpb1_filter` and `gpb2_filter`.
 
@@ -234,27 +248,24 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
         plants, modes = models_of(at(self.plant, step.k)), len(self.initial)
         law = self._find_law_by_mode(step.after)
-        known, pairs, weights, ways = self._describe_pairs(step, law)
+        described = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
+        # Of several plants there is no one function by which the whole mixture moves.
         moments: Any = None
         if len(plants) == 1:
             moments = smoother_step_by_transform(self, merged, first(self.plant)).before
         return ModalSmootherStep(
-            merged.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law, known=known,
-            ways=ways, pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs),
-            weights=weights,
+            merged.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law,
+            known=described.known, ways=described.ways, weights=described.weights,
+            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), described.pairs),
         )  # fmt: skip
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
         """Return the law of a state after a correction, mode by mode."""
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
-    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> tuple[Gaussian, Gaussian, jax.Array, BackwardGain]:
-        """Return what a smoother by pairs needs: Gaussians by mode, pairs (M^2, n), their weights, and the ways back.
-
-        The Gaussians are those that the smoothed modes are compared with: predicted ones, or filtered ones where pairs
-        take z before they are merged. The pairs are those that observe what the future says.
-        """
+    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> _DescribedPairs:
+        """Return what a smoother by pairs of modes needs of a step; `after`: the law by mode after its correction."""
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
         moved = move_pairs(
@@ -265,13 +276,13 @@ class MultipleModelFilter(AbstractSizedFilter):
         known = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
         pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(known.mean, (modes, 1))))
         if not self.merging.corrects_pairs:
-            return known, pairs, weights, moved.back
+            return _DescribedPairs(known=known, pairs=pairs, weights=weights, ways=moved.back)
         j = np.tile(np.arange(modes), modes)
         signal = self.signals_of_pairs(pairs, (np.arange(modes**2), j), k)
         pairs, weight, _ = correct_in_every_mode(
             signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), jnp.asarray(step.z), self.observed_angles
         )
-        return known, pairs, weight.reshape(modes, modes), moved.back
+        return _DescribedPairs(known=known, pairs=pairs, weights=weight.reshape(modes, modes), ways=moved.back)
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:

@@ -80,6 +80,14 @@ def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
     return PartFilter(filter, states)
 
 
+class RelayLine(NamedTuple):
+    """What a relay receives and where: `length` states from `start` on, and the first state of its received signal."""
+
+    start: int
+    length: int
+    place: int
+
+
 class RelayLinesFilter(AbstractWrapper):
     """Best linear filter of (x, past signals of the sensor, past received signals of each relay).
 
@@ -88,20 +96,19 @@ class RelayLinesFilter(AbstractWrapper):
     unconditional moments of l.
 
     base: the filter of these states, whose plant shifts all lines by one and leaves their first places empty.
-    links: the relays' links. lines: for each relay the line that it receives and the place of its received signal, as
-    (start, length, place).
+    links: the relays' links. lines: for each relay the line that it receives and the place of its received signal.
     """
 
     base: AbstractFilter
     links: tuple[SecondOrder, ...]
-    lines: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
+    lines: tuple[RelayLine, ...] = eqx.field(static=True)
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """Move the plant, send the sensor's signal, and receive it at one relay after another."""
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
-            state = _receive_into_line(state, link, *line)
+            state = _receive_into_line(state, link, line)
         return state
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -109,12 +116,13 @@ class RelayLinesFilter(AbstractWrapper):
         return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _receive_into_line(state: LinearBelief, link: SecondOrder, start: int, length: int, position: int) -> LinearBelief:
-    """Receive r = G l + n and put it at `position` of the state.
+def _receive_into_line(state: LinearBelief, link: SecondOrder, received_line: RelayLine) -> LinearBelief:
+    """Receive r = G l + n at a relay, and put it at its place of the state.
 
-    l is the part of the state, `length` numbers from `start` on, that has the signals under way to this link, at the
-    relay before it or at the sensor; M and b are the mean of G and n.
+    l is the part of the state that has the signals under way to this link, at the relay before it or at the sensor; M
+    and b are the mean of G and n.
     """
+    start, length, position = received_line
     # x+ = matrix x + shift: the received signal, of mean M l + b, replaces what stands at its place.
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
@@ -132,7 +140,7 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, start: int, lengt
 
 def enlarge_by_relays(
     plant: AnyPlant, sensor: AnySensor, channel: Relayed
-) -> tuple[AnyPlant, LinearSensor, Channel, tuple[tuple[int, int, int], ...]]:
+) -> tuple[AnyPlant, LinearSensor, Channel, tuple[RelayLine, ...]]:
     """Enlarge the plant by all lines of past signals, the sensor's first and then each relay's.
 
     Returns:
@@ -146,7 +154,7 @@ def enlarge_by_relays(
     start, lines = len(first(plant).states), []
     total = len(first(larger).states)
     for i, (stage, later) in enumerate(zip(channel.stages, channel.stages[1:], strict=False)):
-        lines.append((start, stage.inputs, total))
+        lines.append(RelayLine(start=start, length=stage.inputs, place=total))
         start = total
         total += later.inputs
         larger = at_each_step(partial(_append_relay_line, relay=i, size=stage.outputs, steps=later.past), larger)
