@@ -82,7 +82,7 @@ def signal_of(
         sensor: h and the law of v.
         transform: for an h that is not linear.
         prior: the law of x.
-        start: E[x_i^2] before any data, (n,).
+        start: E[x_i^2] before any data (n,), on which rounding acts.
         noise: of v, in place of the sensor's.
     """
     law = sensor.noise

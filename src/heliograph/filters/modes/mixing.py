@@ -163,7 +163,7 @@ def mix_and_predict(
         parts: Gaussians that are mixed, one a component.
         weight: [c, g], weight of component c in mixture g; columns need not sum to 1.
         u: input.
-        start: E[x_i^2] before any data (n,).
+        start: E[x_i^2] before any data (n,), on which rounding acts.
     """
     share = normalise_columns(weight)
     # Through a nonlinear plant each mixture goes as one Gaussian.
@@ -206,7 +206,7 @@ def move_by_law(
         moves: two arrays, of each Gaussian after the step the number of the mixture that it was before, and the mode
             that moves it.
         u: input.
-        start: E[x_i^2] before any data (n,).
+        start: E[x_i^2] before any data (n,), on which rounding acts.
     """
     mixture_of, mode_of = moves
     if len(plants) == 1:  # each mixture is moved once, however many modes it has afterwards

@@ -74,7 +74,7 @@ def move_pairs(
         transform: of moments, for a nonlinear plant.
         parts: the Gaussian of each mode (M, n).
         u: input.
-        start: E[x_i^2] before any data (n,).
+        start: E[x_i^2] before any data (n,), on which rounding acts.
     """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
