@@ -113,13 +113,7 @@ def build_behind_words(
     # Whether the words' gain as numbers is random, given the mode where it is told: as where bits flip.
     remembers = first(channel).remembers
     fades = (remembers and not told_modes) or any(has_random_gain(law, second_order(law)) for law in laws)
-    if encoder.dither in ("stochastic", "subtracted") and remembers and fades:
-        expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
-        raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
-    if find_rounded(sensor):
-        raise fail(
-            "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
-        )
+    _check_rounding(sensor, encoder, remembers and fades)
     # The sensor of y - c with rounding, and the filter of numbers behind it.
     # Whether the rounding of a Gaussian y is described exactly; filters of modes, and of past signals, use bounds.
     gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers
@@ -142,6 +136,17 @@ def build_behind_words(
         overload=overload,
         **make_sizes(claim, start, len(places) + gains.shape[1]),
     )
+
+
+def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) -> None:
+    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already."""
+    if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
+        expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
+        raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
+    if find_rounded(sensor):
+        raise fail(
+            "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
+        )
 
 
 def _claim_of(overload: Overload) -> Claim:
