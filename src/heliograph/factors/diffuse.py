@@ -187,8 +187,8 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), for finite and infinite parts.
     """
     n, root = len(x.mean), x.root
-    # Sums over the columns k > j that are done: s = noise + sum f_k^2 d_k, s_inf = sum f_k^2 d_inf,k, and the
-    # covariance of x with z, of its infinite part alone once that is not zero.
+    # Sums over the columns k > j, which are done: s = noise + sum f_k^2 d_k, s_inf = sum f_k^2 d_inf,k, and `cross`,
+    # the covariance of x with z. Once z shows an unknown direction, `cross` is of the infinite part alone.
     s, s_inf, cross = noise, jnp.zeros_like(noise), jnp.zeros(n)
     columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
     for j in reversed(range(n)):

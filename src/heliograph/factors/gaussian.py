@@ -350,8 +350,8 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Measure part i of x+: return the rows and variances after it, and its gain."""
-        # N is lower triangular: the parts before i determined omega_0 ... omega_i-1, and part i is the first with
-        # omega_i, which it determines given xi. So omega_i is one more column, with the slope 1 in part i.
+        # N is unit lower triangular, so part i is the first that omega_i is in, and the parts before it have determined
+        # omega_0 ... omega_i-1. So it takes one more column than xi has: that of omega_i, with the slope 1 in part i.
         f, column, r = root[n + i], omega_rows[:, i], weights[i]
         product = d * f
         power = f * product

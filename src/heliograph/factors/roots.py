@@ -64,18 +64,20 @@ def observe_root(
     rows[..., :m, : noise.shape[-1]] = noise
     rows[..., :m, noise.shape[-1] : columns] = output_root
     rows[..., m:, noise.shape[-1] : columns] = root
-    # Dependent components come last, so that the direction which rounding left of them takes nothing from the others.
+    # Dependent components are moved behind the others: what rounding left of them would else take from these.
     independent = _find_independent_rows(rows[..., :m, :columns])
     order = None if independent.all() else np.argsort(~independent, axis=-1, kind="stable")
     if order is not None:
         independent = np.take_along_axis(independent, order, axis=-1)
         rows[..., :m, :] = np.take_along_axis(rows[..., :m, :], order[..., None], axis=-2)
-    lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(-1, -2)
+    lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(
+        -1, -2
+    )  # the triangle: [[V, 0], [K V, W+]]
     v, k_v = lower[..., :m, :m], lower[..., m:, :m]
     gain = _solve_for_gain(v, k_v, independent)
     # The columns of K V that no gain uses stay in the root of what is left.
     unused = np.where(independent[..., None, :], 0.0, k_v)
-    if order is not None:  # the gain's columns in the order of z again
+    if order is not None:  # the gain's columns in the order of z again, by the inverse of the permutation
         gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
     return ObservedRoot(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
 

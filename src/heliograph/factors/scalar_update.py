@@ -159,13 +159,14 @@ def _measure_one_by_one(
 def _measure_in_turns(
     root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
 ) -> Measured:
-    """Compute `measure_rows` in a loop: each turn measures the first row below the state's, and puts it last.
+    """Compute `measure_rows` in a loop, which is a shorter program than `_measure_one_by_one`.
 
-    Before the first one nothing was rounded: what is least there is below every variance.
+    Each turn measures the row behind the n ones of the state and then moves it behind all others, so that the next row
+    to measure has the same place in every turn, and after the last one all are in their order again.
     """
     n = len(d)
 
-    def turn(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
+    def measure_next(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
         """Measure the row of this noise; return what is next, and its innovation with the variance."""
         root, d, news, least = carry
         rows, d, gain, variance_of_row = measure_row(root, d, root[n], noise, least[0])
@@ -177,8 +178,9 @@ def _measure_in_turns(
         carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, 0)
         return carry, (innovation, variance_of_row)
 
+    # -1 is below every variance: before the first row nothing was rounded.
     start = root, d, news, jnp.concatenate([jnp.full_like(least[:1], -1.0), least[1:]])
-    (root, d, news, _), (values, totals) = lax.scan(turn, start, variance)
+    (root, d, news, _), (values, totals) = lax.scan(measure_next, start, variance)
     return root, d, news, values, totals
 
 

@@ -81,19 +81,19 @@ def solve_factored_weights(
         W, of which W[:, i] multiplies the estimate of node i; these sum to I.
     """
     nodes, n, sources = shared.shape
-    # With B = F F': F^-1 L and F^-1 E.
+    # With B = F F': F^-1 L and F^-1 E, where the independent parts of errors have the covariance I.
     factors = jnp.linalg.cholesky(jnp.asarray(independent))
-    both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
-    white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
-    white_l, white_e = white[:, :sources], white[:, sources:]
+    l_and_e = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
+    whitened = jax.lax.linalg.triangular_solve(factors, l_and_e, left_side=True, lower=True).reshape(nodes * n, -1)
+    f_l, f_e = whitened[:, :sources], whitened[:, sources:]
     # F' P^-1 E by the lemma.
-    inner = jnp.linalg.cholesky(jnp.eye(sources) + white_l.T @ white_l)
-    reduced = white_e - white_l @ jax.scipy.linalg.cho_solve((inner, True), white_l.T @ white_e)
-    # E' P^-1 E, and P^-1 E (nodes, n, n), whose transpose E' P^-1 is (n, nodes n).
-    information = white_e.T @ reduced
-    solved = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
-                                             transpose_a=True)  # fmt: skip
-    weights = jnp.linalg.solve(information, jnp.moveaxis(solved, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
+    inner = jnp.linalg.cholesky(jnp.eye(sources) + f_l.T @ f_l)
+    f_p_e = f_e - f_l @ jax.scipy.linalg.cho_solve((inner, True), f_l.T @ f_e)
+    # E' P^-1 E, and P^-1 E (nodes, n, n), with the axes of the latter moved so that it is E' P^-1 (n, nodes n).
+    information = f_e.T @ f_p_e
+    p_e = jax.lax.linalg.triangular_solve(factors, f_p_e.reshape(nodes, n, n), left_side=True, lower=True,
+                                          transpose_a=True)  # fmt: skip
+    weights = jnp.linalg.solve(information, jnp.moveaxis(p_e, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
     # Rounding takes the sum of the weights off I: divide by it.
     unbiased = jnp.linalg.solve(weights.sum(axis=1), weights.reshape(n, -1))
     return jnp.asarray(unbiased.reshape(n, nodes, n))

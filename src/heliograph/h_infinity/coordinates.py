@@ -68,9 +68,9 @@ def scale_steps(
 ) -> tuple[list[StepMatrices], Coordinates]:
     """Return the steps in coordinates in which all numbers are of order one, and the way back to the user's units.
 
-    Scales are deviations of x, e and what is received that disturbances of unit variance, as independent noises, would
-    cause, with the `gains` (or, of None, nearly the best predictor's) in the loop. Errors are about these gains, so
-    that the unknown of a scaled step is a correction of its nominal gain.
+    Scales are the deviations of x, e and what is received, if disturbances were independent noises of unit variance and
+    the filter had these `gains`; None stands for gains near the best predictor's. These are the nominal gains of the
+    scaled steps, whose unknown is a correction of them.
     """
     n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
     # Covariances of x_0 and e_0 from the initial weight.
@@ -83,11 +83,13 @@ def scale_steps(
         eta = _compute_eta_covariance(system, k, step, x, e)
         largest_target = max(largest_target, float(np.trace(step.target @ eta)))
         x, e, received, gain = _propagate_covariances(step, eta, None if gains is None else gains[k])
-        nominal = gain if gains is not None or k == 0 else _keep_gain(nominal, gain, received, e)
+        is_taken_as_it_is = gains is not None or k == 0  # else the gain of the step before may serve
+        nominal = gain if is_taken_as_it_is else _keep_gain(nominal, gain, received, e)
         state_scales.append(_choose_state_scales(x, e, nothing_grows))
         received_scales.append(_powers_of_four_near(np.sqrt(np.diagonal(received))))
         eta_scales = _choose_eta_scales(system, k, step, state_scales[k])
-        # Growth forms to the order of one; they are diagonal, and with growth so are the scales of eta.
+        # Scales that make the largest entry of each growth form 1. Forms are diagonal, and so, with growth, are the
+        # scales of eta.
         size = np.max(np.abs(step.growth) * np.diagonal(eta_scales) ** 2, axis=1, initial=0.0)
         form_scales.append(np.where(size > 0, size, 1.0))
         scaled.append(_rescale_step(step, eta_scales, state_scales[k + 1], received_scales[k], form_scales[k], nominal))

@@ -120,13 +120,14 @@ def check_growth(
     seed: int = 0,
     differences: bool = True,
 ) -> GrowthFinding:
-    """Search a box for a function's largest slope, and for a pair or a proof that decides on a growth constant.
+    """Search a box for a function's largest slope, for a pair that refutes a growth constant, and for a proof of it.
 
-    Norms of Jacobians by automatic differentiation at 4,096 points of a Sobol sequence, then random moves of shrinking
-    size from the steepest. Pairs start close together along the steepest directions, and far apart, and move likewise.
-    A box is convex, so in it the largest slope is the smallest true constant. Where f is written in operations that
-    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box. A box
-    with 0 in it then proves |f(x)| <= a |x| too.
+    Slopes are norms of Jacobians, by automatic differentiation, at 4,096 points of a Sobol sequence; from the steepest
+    ones the search goes on by random moves of shrinking size. Pairs start close together along the steepest directions,
+    and far apart, and move likewise. A box is convex, so in it the largest slope is the smallest true constant. Where f
+    is written in operations that interval arithmetic can follow, the constant is then proved by bounds of the Jacobian
+    over parts of the box. An f(0) that is not 0 refutes any constant, so that a proof over a box with 0 in it holds for
+    |f(x)| <= a |x| too.
 
     Args:
         function: f, from (n,) to (m,) or a number, written with jax.numpy.

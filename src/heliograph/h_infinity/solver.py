@@ -235,7 +235,7 @@ class HorizonProblem:
         forms: LinearForms | None = None
         # Every step's inequality, from the weight before it to its own.
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
-            # The forms of the step before serve an equal step with free gains.
+            # The forms of the step before serve a step with the same matrices. With given gains they differ by step.
             is_like_last = forms is not None and layout.gain is None and all(map(np.array_equal, step, steps[k - 1]))
             if forms is None or not is_like_last:
                 forms = make_linear_forms(step, layout)
@@ -266,8 +266,8 @@ class HorizonProblem:
             start: an initial weight that may couple x and e, at the first step; else None.
         """
         q, width = len(step.energy), len(fixed)
-        # -Phi = level^2 energy - target + weight before - next energy, for each part of eta that is coupled. `entries`:
-        # the places of the part's matrix in the flat q x q one.
+        # -Phi = level^2 energy - target + weight before - next energy. It falls apart into blocks: `coupled` are the
+        # components of eta of a block, `entries` the places of the block in the flat q x q matrix.
         constant = -step.target
         constant[:width, :width] += fixed
         for coupled in find_independent_parts(step, forms, start):

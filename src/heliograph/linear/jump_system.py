@@ -95,28 +95,31 @@ class JumpSystem(NamedTuple):
     def adjoint(self, weights: Float[np.ndarray, "time n n"], forever: bool) -> Float[np.ndarray, "time M n n"]:
         """Return the derivative L of sum_k <W_k, sum_j X_k,j> by each X_k,j, through all later steps.
 
-        L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l, from zero behind the last step, or around a period.
+        L_k,i = W_k + sum_l T_k+1,il F_k+1,l' L_k+1,l F_k+1,l, from the last step to the first. Behind the last step L
+        is zero; or, if the steps repeat `forever`, it is that of the next period.
         """
-        shape = self.shape
+        modes_before, n, _n = self.shape
 
         def go_back(later: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-            """Return the derivative by X before the first step, and L of each step; `later`: that by X after the last.
+            """Return the derivative by X before the first step, and L of each step, with these weights W.
 
-            L of a step is its weight and the derivative through later steps.
+            `later` is the derivative by X after the last step, through what follows it.
             """
             derivatives = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 derivatives.append(weight + later)
                 later = mix_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivatives[-1], 0.0))
-            return later[..., : shape[0], :, :], derivatives[::-1]
+            return later[..., :modes_before, :, :], derivatives[::-1]
 
-        later = np.zeros(shape)
-        if forever:  # the derivative after the period is that before the next one: a linear fixed point
-            of_own_weights, _ = go_back(later, weights)
-            later = solve_fixed_point(lambda x: go_back(x, 0.0 * weights)[0], of_own_weights)
+        later = np.zeros((modes_before, n, n))
+        # The derivative after a period is that before the next one: a fixed point. Going back over a period is a linear
+        # map and a constant, the part that comes from the weights of that period.
+        if forever:
+            from_one_period, _ = go_back(later, weights)
+            later = solve_fixed_point(lambda x: go_back(x, 0.0 * weights)[0], from_one_period)
         _, derivatives = go_back(later, weights)
-        by_step = np.array([np.broadcast_to(value, self.maps.shape[1:]) for value in derivatives])
-        return np.asarray(by_step + by_step.swapaxes(-1, -2)) / 2
+        by_step = np.array([np.broadcast_to(derivative, self.maps.shape[1:]) for derivative in derivatives])
+        return np.asarray(by_step + by_step.swapaxes(-1, -2)) / 2  # symmetric, as rounding left it nearly
 
     def _propagate_one_period(self, moments: Array) -> Any:
         """Propagate X from before the first step to after the last, summed over modes that are redrawn there."""

@@ -97,6 +97,7 @@ def lift_modes(
     lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
     matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
+    # That is not so of step 0, in which the chain does not move: the last one is at least step 1.
     steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
     steps, roundings, last_law = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
@@ -117,7 +118,7 @@ def lift_modes(
         second, chain = next_second, np.asarray(measurement.transition)
     over_time = Steps(*(repeat_last(values, len(plants)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
-    whole = np.tile(projection, (1, modes))
+    whole = np.tile(projection, (1, modes))  # x is the sum over the modes of x 1{mode}
     return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
 
 

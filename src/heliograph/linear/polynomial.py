@@ -228,22 +228,24 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
         states: number of components of x.
         outputs: number of components of z.
     """
+    # The place of each product by the numbers of its factors: (i,) of x_i, (i, j) of x_i x_j.
     x_places, z_places = _place_products(states), _place_products(outputs)
     state = state_moments(square)
     largest = 0.0
     for k in range(square.horizon):
-        s, spread = square.step(k), state.covariance[k + 1]
-        cross = s.output @ spread
+        step, spread = square.step(k), state.covariance[k + 1]
+        cross = step.output @ spread
         # Joint covariance and mean of (products of x, products of z), and the places of x and z themselves in it.
-        joint = np.block([[spread, cross.T], [cross, cross @ s.output.T + s.noise]])
-        mean = np.concatenate([state.mean[k + 1], s.output @ state.mean[k + 1] + s.offset])
+        joint = np.block([[spread, cross.T], [cross, cross @ step.output.T + step.noise]])
+        mean = np.concatenate([state.mean[k + 1], step.output @ state.mean[k + 1] + step.offset])
         first_z = len(spread)
         linear = [x_places[(i,)] for i in range(states)] + [first_z + z_places[(i,)] for i in range(outputs)]
         for places, start in ((x_places, 0), (z_places, first_z)):
+            # Places of the product a b, of a and of b.
             pairs = [
-                (start + product, start + places[(key[0],)], start + places[(key[1],)])
-                for key, product in places.items()
-                if len(key) == 2
+                (start + product, start + places[(factors[0],)], start + places[(factors[1],)])
+                for factors, product in places.items()
+                if len(factors) == 2
             ]
             largest = max([largest, *(_largest_third_moment(joint, mean, pair, linear) for pair in pairs)])
     return largest

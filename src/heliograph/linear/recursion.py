@@ -108,15 +108,15 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     second_moments = system.mean**2 + np.diag(system.covariance)
     noises = take_noise_roots(system.step(0), second_moments)
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
-    steady_from, last = system.steady_from, None
+    steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
     for k in range(system.horizon):
         # From `steady_from` on all steps of the system are the same. There, every SPAN steps, see whether the error
         # covariance has come to rest: then all later gains are the last ones, to rounding.
         if k > steady_from and (k - steady_from) % SPAN == 0:
             now = covariance_of_root(root), rounding.covariance
-            if last is not None and _has_converged(now, last, gains_by_step[-1].transition):
+            if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
                 break
-            last = now
+            before = now
         s = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = take_noise_roots(s, second_moments)

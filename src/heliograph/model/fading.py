@@ -141,22 +141,23 @@ def with_flag(
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
     """
-    # The chain, or all memories of the channel.
+    # The chain, or all memories of the channel. Classes need a single chain, of whose modes they tell.
     late = flag("late", late)
     held = list(memories(channel).values())
-    if chain is None and (not held or (probabilities is not None and len(held) > 1)):
+    is_undecided = not held or (probabilities is not None and len(held) > 1)
+    if chain is None and is_undecided:
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
-    # The states themselves.
+    # No classes: the states themselves are received.
     if probabilities is None:
         outputs = [ModeOutput(m, channel.inputs) for m in (held if chain is None else [chain])]
         return Stack([channel, *(OneStepLate(output) if late else output for output in outputs)])
     memory = held[0] if chain is None else chain
     if not isinstance(memory, MarkovChain):
         raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
-    # Classes: in each mode a noise whose values are the flags, and nothing of what is sent.
-    rows = array("flags", probabilities, (memory.modes, None))
-    no_signal, flags = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
-    classes = Modes(memory, [GainAndNoise(Constant(1.0), no_signal, FiniteSupport(flags, row)) for row in rows])
+    # A flag is a map with a gain of zero and a noise: the classes 0, 1, ... are its values, with a law for each mode.
+    laws = array("flags", probabilities, (memory.modes, None))
+    no_signal, flags = np.zeros((1, channel.inputs)), np.arange(laws.shape[1])[:, None]
+    classes = Modes(memory, [GainAndNoise(Constant(1.0), no_signal, FiniteSupport(flags, law)) for law in laws])
     return Stack([channel, OneStepLate(classes) if late else classes])
 
 

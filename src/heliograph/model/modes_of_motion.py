@@ -264,7 +264,7 @@ def markov_plant(
         ValueError: fewer than two models, models of other states, inputs, angles, limits or laws of x_0 than the first,
             probabilities that are none; rates that are none, or without an input "dt" or an initial law.
     """
-    # Models that differ in their law of motion alone.
+    # The models may differ in their law of motion alone.
     plants = _check_models("models of a plant", models, AbstractPlant)
     for i, plant in enumerate(plants[1:], start=1):
         for what in ("states", "inputs", "circular", "limits"):
@@ -278,8 +278,9 @@ def markov_plant(
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:
         return ModalPlant(_read_chain(transition, initial, name, modes, len(plants)), plants)
-    # Rates in place of a chain: its transition is the identity, and the rates move the mode by the time between rows.
-    if initial is None:
+    # With rates, it is these that move the mode, by the time between rows. The chain only holds the number of modes and
+    # the initial law: it never switches by itself, so its transition is the identity.
+    if initial is None:  # a law is asked for, since the identity has no stationary one of its own
         raise fail("rates of the modes", "initial=, the law of the mode of the first row, beside them", "none")
     if transition is not None or modes is not None:
         given = "transition=" if modes is None else "modes="
@@ -372,7 +373,7 @@ def _read_chain(
     Raises:
         ValueError: both or neither of `transition` and `modes`, another number of modes, uncertain transitions.
     """
-    # One of both: a transition, or another model whose only memory is a chain.
+    # Exactly one of the two says the chain: a transition, or another model whose only memory is a chain.
     if (transition is None) == (modes is None):
         raise fail("chain of the modes", "transition=, or modes= of a model that has them",
                    "none" if modes is None else "both")  # fmt: skip

@@ -1,6 +1,7 @@
 """Relay networks: a plant observed by a sensor, relays that filter and forward, and a receiver, slot by slot."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -109,9 +110,8 @@ class RelayNetwork(Module):
         varies = steps_covered(self.slots) is not None
         period = horizon if varies else min(len(self.slots), horizon)
         by_slot = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
-        gain, offset, spread, receives, transmits = (
-            np.stack(parts)[np.arange(horizon) % period] for parts in zip(*by_slot, strict=True)
-        )
+        slot_of_step = np.arange(horizon) % period
+        slots = _SlotMoments(*(np.stack(parts)[slot_of_step] for parts in zip(*by_slot, strict=True)))
         transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
         drift = _repeat_over_steps(self.plant, horizon, lambda p: p.noise.mean, 1)
         # E x+ = A E x + E w.
@@ -126,11 +126,11 @@ class RelayNetwork(Module):
             sensor_noise=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.covariance, 2),
             sensor_offset=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.mean, 1),
             state_mean=np.array(means),
-            gain=gain,
-            offset=offset,
-            spread=spread,
-            receives_in_slot=receives,
-            transmits_in_slot=transmits,
+            gain=slots.gain,
+            offset=slots.offset,
+            spread=slots.spread,
+            receives_in_slot=slots.receives,
+            transmits_in_slot=slots.transmits,
             received=self.received,
         )
 
@@ -179,17 +179,27 @@ class RelaySteps(Module):
         )
 
 
-def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
+class _SlotMoments(NamedTuple):
+    """Moments of the R numbers that are received in a slot, given the T numbers that are sent in it.
+
+    gain, offset: their means. spread: covariances of the entries of gain and offset, the offset as entry T.
+    receives, transmits: 1 for each number that is received, and for each sender that transmits, in the slot; else 0.
+    """
+
+    gain: Float[np.ndarray, "R T"]
+    offset: Float[np.ndarray, " R"]
+    spread: Float[np.ndarray, "R R T+1 T+1"]
+    receives: Float[np.ndarray, " R"]
+    transmits: Float[np.ndarray, " senders"]
+
+
+def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMoments:
     """Return second moments of all that is received in one slot, given all that is sent in it.
 
     Args:
         network: the network.
         slot: links of the slot, by listener and sender.
         k: step, at which links that vary are read.
-
-    Returns:
-        Mean gain (R, T) and offset (R,) of the R received numbers from the T sent ones; spread (R, R, T + 1, T + 1) of
-        gain and offset; which numbers are received (R,), and which senders transmit (senders,), as 1 and 0.
     """
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
     rows, columns = sum(network.received), len(senders) * m
@@ -207,10 +217,10 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np
             sent = m * senders.index(sender) + np.arange(m)
             gain[np.ix_(received, sent)] = moments.mean_gain
             offset[received] += moments.offset
-            with_one = np.append(sent, columns)
-            spread[np.ix_(received, received, with_one, with_one)] += moments.nominal.center
+            sent_and_one = np.append(sent, columns)  # the offset stands behind the gains of all that is sent
+            spread[np.ix_(received, received, sent_and_one, sent_and_one)] += moments.nominal.center
             receives[received], transmits[senders.index(sender)] = 1.0, 1.0
-    return gain, offset, spread, receives, transmits
+    return _SlotMoments(gain=gain, offset=offset, spread=spread, receives=receives, transmits=transmits)
 
 
 def _repeat_over_steps(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:

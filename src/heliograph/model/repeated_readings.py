@@ -139,7 +139,7 @@ def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -
 def stuck_counts(
     received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None
 ) -> Float[np.ndarray, " received"] | None:
-    """Return after how many equal readings in a row each received number is that of a sensor that is stuck.
+    """Return of each received number how many equal readings in a row mean that its sensor is stuck.
 
     Args:
         received: how many numbers are received.
@@ -149,22 +149,23 @@ def stuck_counts(
         channel: its channel, which must deliver the outputs as they were sent.
 
     Returns:
-        Counts (received,), infinite of a number that may repeat; None where all may.
+        Counts (received,), infinite for a number that may repeat; None where all may.
 
     Raises:
         ValueError: another count of them, fewer than 2 readings, a sensor or a channel that does not say.
     """
     # One answer for all received numbers, or one for each.
     expected = f"True, a whole number of equal readings from 2 to {MOST:,}, None, or a list of {received} of these"
-    for_all = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
-    if not for_all and not isinstance(stuck, Sequence | np.ndarray):
+    is_for_all = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
+    if not is_for_all and not isinstance(stuck, Sequence | np.ndarray):
         raise fail("stuck", expected, show_value(stuck))
-    each = [stuck] * received if for_all else list(stuck)  # type: ignore[arg-type]
-    if isinstance(stuck, str) or len(each) != received:
+    each = [stuck] * received if is_for_all else list(stuck)  # type: ignore[arg-type]
+    if isinstance(stuck, str) or len(each) != received:  # a text is a sequence too
         raise fail("stuck", expected, show_value(stuck))
     counts = np.full(received, np.inf)
     for i, wanted in enumerate(each):
-        if wanted is None or (isinstance(wanted, bool | np.bool_) and not wanted):
+        may_repeat = wanted is None or (isinstance(wanted, bool | np.bool_) and not wanted)
+        if may_repeat:
             continue
         if isinstance(wanted, bool | np.bool_):  # True: by the law of the noise
             counts[i] = _count_by_law(received, sensor, channel)[i]

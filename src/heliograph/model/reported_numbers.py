@@ -178,11 +178,15 @@ def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
 
 
 def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:
-    """Return what is built of channels, with all that is told of them after z: it passes by whatever is built."""
+    """Return what `build` makes of channels, and behind its outputs all numbers that the channels tell the receiver.
+
+    A channel may tell numbers about itself beside each message, such as its present gain. These do not go through what
+    is built: `build` gets the links without them, and they are delivered as they are.
+    """
     links = [separate_told(channel).link for channel in channels]
     built = build(links)
-    apart = any(link is not channel for link, channel in zip(links, channels, strict=True))
-    return cast(M, deliver_told(built)) if apart else built
+    some_tell = any(link is not channel for link, channel in zip(links, channels, strict=True))
+    return cast(M, deliver_told(built)) if some_tell else built
 
 
 def stack_with_told(

@@ -144,13 +144,14 @@ class Sensor(AbstractSensor):
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
-        # A function of x alone: the number of outputs is that of their names, or of the noise's components.
+        # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
         self.function, law = _take_state_alone(measure), _require_constant("sensor noise", noise)
-        dimension = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
-        self.noise = as_noise("sensor noise", law, dimension)
-        self.outputs = names("sensor outputs", outputs, dimension, "y")
-        # A variance alone says nothing of the number of outputs, so the function is asked.
-        shape = (1,) if outputs is not None or count_components(law) is not None else _find_output_shape(measure)
+        count = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+        self.noise = as_noise("sensor noise", law, count)
+        self.outputs = names("sensor outputs", outputs, count, "y")
+        # A variance alone says nothing of the number of outputs: without names the function must have one.
+        is_said = outputs is not None or count_components(law) is not None
+        shape = (1,) if is_said else _find_output_shape(measure)
         if shape != (1,):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
@@ -197,11 +198,10 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
-        # C or the noise depends on inputs.
         self.inputs = name_inputs(inputs)
         if self.inputs:
-            rows = count_rows(matrix, self.inputs)
-            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows, self.inputs)
+            count = count_rows(matrix, self.inputs)  # C has a row for each output
+            self.outputs, self.noise = read_noise_of_inputs(noise, outputs, count, self.inputs)
             C: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = C if callable(matrix) else array("sensor matrix", C, ("outputs", "states"))
             self.circular = read_angles("circular outputs", circular, self.outputs)

@@ -36,7 +36,7 @@ def check_turns(
         center: a state (n,).
         given: which components of a state are angles and attitudes.
         results: which components of f(x) are.
-        rest: further arguments of f.
+        rest: further arguments of f, such as inputs.
     """
     if not (given.angles or given.rotations) or is_traced(center):
         return
@@ -44,14 +44,15 @@ def check_turns(
     center = np.asarray(center)
     turned = center + TURN * np.eye(len(center))[list(given.angles)]
     _compare_turned(f"{name} with circular states", function, center, turned, results, rest)
-    # Attitudes: at one that is no special case, with rates that are not 0, and by its other rotation vector.
+    # Attitudes: f is asked at a general state, since the center's attitude may be a special case, such as no turn at
+    # all. Every attitude there has a second rotation vector, a full turn longer, at which f has to be the same.
     change = np.zeros(len(center))
     change[list(given.rotations)] = np.resize(SOME_TURN, len(given.rotations))
-    some = given.plus(center, change)
-    others = [_turn_fully(some, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
-    rates = tuple(np.ones_like(values) for values in rest)
+    general_state = given.plus(center, change)
+    others = [_turn_fully(general_state, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
+    ones = tuple(np.ones_like(values) for values in rest)  # inputs of 0, such as turn rates, could hide a change
     kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
-    _compare_turned(kind, function, some, others, results, rates)
+    _compare_turned(kind, function, general_state, others, results, ones)
 
 
 def _compare_turned(
@@ -76,21 +77,26 @@ def _compare_turned(
         return
     # f at the state and at each of its other forms, by one compiled program.
     try:
-        start, *values = compute_once(_values_at, _values_by_xla, (function, np.stack([center, *turned]), rest))
+        at_center, *values = compute_once(_values_at, _values_by_xla, (function, np.stack([center, *turned]), rest))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
-    # Differences but for full turns, beyond the rounding of 2 pi in a steep function.
+    # What is more than full turns of the results, and more than the rounding of 2 pi in a steep function.
     for value, other in zip(values, turned, strict=True):
-        change = np.abs(results.difference(np.asarray(value), np.asarray(start)))
-        if np.any(change > SAME * (1 + np.abs(start))):
-            places = np.flatnonzero(other != center).tolist()
-            words = f"state {places[0]}" if len(places) == 1 else f"states {places}"
-            got = f"a change of {change.max():.3g} by a turn of {words}"
+        change = np.abs(results.difference(np.asarray(value), np.asarray(at_center)))
+        if np.any(change > SAME * (1 + np.abs(at_center))):
+            turned_states = np.flatnonzero(other != center).tolist()
+            named = f"state {turned_states[0]}" if len(turned_states) == 1 else f"states {turned_states}"
+            got = f"a change of {change.max():.3g} by a turn of {named}"
             raise fail(name, "one that a full turn does not change", got)
 
 
 def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
-    """Return the state with the other rotation vector of the same attitude, the long way round."""
+    """Return the state with another rotation vector of the same attitude: the turn back, the long way round.
+
+    Args:
+        x: the state.
+        places: of the rotation vector's three components in it.
+    """
     r = x[list(places)]
     other: np.ndarray = x.copy()
     other[list(places)] = r * (1 - TURN / np.linalg.norm(r))

@@ -90,16 +90,18 @@ class AbstractRandomAffine(Module):
         held = memories(self)
         if not held:
             return self._init(key)
-        rest, *keys = jax.random.split(key, len(held) + 1)
-        return init_with_shared_memories(self, rest, keys)
+        # A key for each memory, which is drawn once even where several maps inside share it, and one for the maps.
+        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        return init_with_shared_memories(self, key_of_maps, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
         held = memories(self)
         if not held:
             return self._draw(state, key)
-        rest, *keys = jax.random.split(key, len(held) + 1)
-        return draw_with_shared_memories(self, state, rest, keys)
+        # A key for each memory, which moves once even where several maps inside share it, and one for the maps.
+        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the initial state of a map that contains no modes."""

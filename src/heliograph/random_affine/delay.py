@@ -315,7 +315,7 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
     links = check_maps("series", links)
     if not any(link.past for link in links):
         return Series(links)
-    # A stage is a link with a random delay and all that follow it with constant ones.
+    # A stage is the first link or one with a random delay, and all links with constant ones that follow it.
     stages: list[list[AbstractRandomAffine]] = [[links[0]]]
     for link in links[1:]:
         if link.past and not isinstance(link, Delayed):
@@ -345,14 +345,16 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
         raise fail("series", "links each delayed by itself", "a combination of delayed links")
     # The first link's own delay, which may be random (None without one), and the constant ones that are added to it.
     first, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
-    # A time stamp would have to be that of the whole delay: only the last delay may have one, and of the first link's
-    # own none may follow.
+    # A time stamp has to tell the whole delay. One that is written before a later delay does not; nor does that of a
+    # constant delay behind one of the first link's own, which may be random.
     timestamped = [link.timestamped for link in delays]
-    if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and first is not None):
+    misses_later_delays = any(timestamped[:-1])
+    misses_first_delay = timestamped[-1] and len(delays) > 1 and first is not None
+    if misses_later_delays or misses_first_delay:
         raise fail("time stamps", "those of one link", "those of several in series")
-    # A link that remembers cannot be moved to behind the delay.
-    last = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
-    for link in links[:last]:
+    # All links before the last delay come behind it then, which only those that forget may.
+    last_delay = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
+    for link in links[:last_delay]:
         if link.remembers:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
     # The links without delays behind one delay: the first link's own, and the constant ones.

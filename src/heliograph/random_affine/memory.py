@@ -46,7 +46,7 @@ class ChannelState(NamedTuple):
 
 
 def init_with_shared_memories(channel: Any, key: jax.Array, keys: Sequence[jax.Array]) -> ChannelState:
-    """Draw a channel's state before the first draw, with one key for each of its `memories`."""
+    """Draw a channel's state before the first draw: each of its memories by one of `keys`, then the rest by `key`."""
     states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
     return ChannelState(states, condition_on_memories(channel, states).init(key))
 
@@ -54,7 +54,7 @@ def init_with_shared_memories(channel: Any, key: jax.Array, keys: Sequence[jax.A
 def draw_with_shared_memories(
     channel: Any, state: ChannelState, key: jax.Array, keys: Sequence[jax.Array]
 ) -> tuple[ChannelState, jax.Array]:
-    """Draw H given the memories' states, and move these; memories of one key move alike."""
+    """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H."""
     rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
     held = memories(channel).values()
     return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h

@@ -298,18 +298,22 @@ def _tune_gains(
 
 
 def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return by slot tr P of the receiver with its own gains, whether all moments are sound, and the relays' powers."""
+    """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers."""
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
-    receiver = steady.moments[1:, -n:, -n:]  # the receiver's error is the last part of the moments
-    return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), jnp.sum(steady.power[:, 1:], axis=1)
+    # The moments begin with those before the first slot. The receiver's error is the last part of what they are of.
+    receiver = steady.moments[1:, -n:, -n:]
+    relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
+    return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
 
 
 def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers."""
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)
+    # The receiver's own part of the moments is left out: its gains among `gains` are not used.
     sound = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
-    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(steady.power[:, 1:], axis=1)
+    relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
+    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), sound, relay_powers
 
 
 _receiver_cost = make_penalised_cost(_trace_receiver_errors)

@@ -106,19 +106,28 @@ SmoothChunks = Callable[..., SmoothedChunk | None]  # of states, which chunks, a
 def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
     """Smooth all chunks side by side, and again those that a neighbour contradicts; None without native code.
 
-    A chunk has `own` rows. It filters `ahead` rows more and passes back over these, begun by the filter's own law at
-    their end, which they forget: so it enters its own rows by the law that all later data give.
+    A chunk has `own` rows, of which it smooths the estimates, and a window of these and the `ahead` rows behind them.
+    It filters its window and passes back from the window's end, where it begins with the filtered law instead of the
+    smoothed one. Over the `ahead` rows that is forgotten, so it enters its own rows with the law that all later data
+    give.
     """
     total, (own, ahead) = len(rows[0]), begun.lengths
     windows = take_windows(rows, begun.first, own + ahead)
-    ends = np.minimum(begun.first + own + ahead, total)
+    window_ends = np.minimum(begun.first + own + ahead, total)
 
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
-        """Smooth some chunks from these states; backwards from `later` at the end of their own rows, if given."""
+        """Smooth the chunks `which`, filtered from these states; None without native code.
+
+        They pass back from the end of their windows; or, with `later`, from the end of their own rows, where `later` is
+        the smoothed law.
+        """
         first = begun.first[which]
-        end = ends[which] if later is None else first + own
-        laws = gaussian_of(states) if later is None else later
-        arguments = recursion, states, take(windows, which), first, end, laws, np.full(len(first), later is not None)
+        is_given = np.full(len(first), later is not None)
+        if later is None:
+            pass_back_from, laws = window_ends[which], gaussian_of(states)  # these laws are not used
+        else:
+            pass_back_from, laws = first + own, later
+        arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
         differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
         choice = choose_code(smooth_chunk, arguments, differs_by_chunk)
         return None if choice.code is None else choice.results()
@@ -127,17 +136,18 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         """Smooth all chunks as if they were settled."""
         return smooth_settled_chunks(recursion, settled, begun, windows)
 
-    # Chunks whose covariances stand still, of which means alone are computed, have complete rows: their own and those
-    # behind, none of them beyond the end.
+    # Means alone are computed of chunks in which covariances stand still: that takes a window in which everything
+    # arrived, and which does not reach beyond the last row.
     is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & is_complete)
     results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
     if results is None:
         return None
-    # In place: forwards, chunks that began with another state than that in which the one before them ends; then back.
+    # Repaired in place: from the first chunk on, those that began in another state than that in which the one before
+    # them ends; then from the last one back, those that a later chunk contradicts.
     rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
     _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
-    parts = results.estimate, results.nis, results.received
+    parts = results.estimate, results.nis, results.received  # (chunks, own, ...) each
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], parts)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
 

@@ -55,8 +55,8 @@ def with_bias(
     instance("sensor with a bias", sensor, AbstractSensor, "one that does not vary")
     n, outputs = len(plant.states), len(sensor.outputs)
     check_sensor(sensor, n)
-    # How many biases there are: a plant of b says, or the outputs, or E; else D, of which any number
-    # of columns is accepted.
+    # How many biases there are: a plant of b says, or the outputs, or the columns of E. Else the columns of D say, and
+    # `count` stays a name, with which `array` takes any number of them.
     by_output = coupling is None and loading is None
     count: int | str = "biases"
     if isinstance(bias, LinearPlant):
@@ -96,13 +96,13 @@ def _make_gauss_markov(
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
     rates = [_compute_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     # Deviation and 1 / T of each bias, as arrays (biases,).
-    size, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
-    xp = library(size, rate)
-    start, center = xp.diag(size**2), np.zeros(count)
+    sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
+    xp = library(sd, rate)
+    start, center = xp.diag(sd**2), np.zeros(count)
     # A step that is a number makes constants; else the matrices are functions of the input that says it.
     if not isinstance(dt, str):
         step = scalar("time of a step", dt, 0.0)
-        noise = xp.diag(size**2 * -xp.expm1(-2 * step * rate))
+        noise = xp.diag(sd**2 * -xp.expm1(-2 * step * rate))
         return LinearPlant(xp.diag(xp.exp(-step * rate)), noise, center, start, states=names)
     if dt not in plant.inputs:
         raise fail("dt", f"a number, or one of the inputs {list(plant.inputs)}", repr(dt))
@@ -113,7 +113,7 @@ def _make_gauss_markov(
 
     def noise_over(u: jax.Array) -> jax.Array:
         """Return the covariance of xi over a step of length u[0]."""
-        return jnp.diag(jnp.asarray(size) ** 2 * -jnp.expm1(-2 * u[0] * rate))
+        return jnp.diag(jnp.asarray(sd) ** 2 * -jnp.expm1(-2 * u[0] * rate))
 
     return LinearPlant(matrix_over, noise_over, center, start, states=names, inputs=[dt])
 
@@ -161,22 +161,24 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
     states = (*plant.states, *new_names.values())
     circular = (*plant.circular, *(new_names[name] for name in bias.circular))
     limits = (*plant.limits, *((new_names[name], ends) for name, ends in bias.limits))
-    # Both laws of the initial state, and of the noises.
+    # An initial state is a center and a draw of a law, whose mean may be another than 0 (a mixture, say).
     laws = [model.deviation or Gaussian(model.initial_covariance) for model in models]
     centers = [model.initial_mean - law.mean for model, law in zip(models, laws, strict=True)]
     center, start = library(*centers).concatenate(centers), Independent(laws)
-    # Independent noises: as one law, or under the inputs where one of them depends on these.
+    # The noises are one law if both are laws. Else one of them is a covariance that depends on the inputs.
     places = tuple(plant.inputs.index(name) for name in bias.inputs)
-    noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
+    constant_noises = [model.noise for model in models if isinstance(model.noise, AbstractNoise)]
     all_inputs = tuple(range(len(plant.inputs)))
-    noise = Independent(noises) if len(noises) == 2 else JointNoise(models, (all_inputs, places))
+    both_are_laws = len(constant_noises) == len(models)
+    noise = Independent(constant_noises) if both_are_laws else JointNoise(models, (all_inputs, places))
     if not isinstance(plant, LinearPlant):
-        move = DrivenTransition(plant, bias, coupling, places)
         if np.any(np.asarray(coupling)[list(plant.manifold.rotations)]):
             raise fail("bias of a plant", "a coupling of 0 to attitudes, which have no sum", list(plant.attitude))
+        move = DrivenTransition(plant, bias, coupling, places)
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
-    matrix, driven = _stack_blocks(plant, bias, coupling, np.eye(len(plant.inputs))[list(places)])
-    return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs, circular, limits)
+    inputs_of_bias = np.eye(len(plant.inputs))[list(places)]  # takes those of b out of all inputs
+    matrix, input_matrix = _stack_blocks(plant, bias, coupling, inputs_of_bias)
+    return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 
 
 def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:

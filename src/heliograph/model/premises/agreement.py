@@ -39,13 +39,13 @@ ENCODER = "encoder"
 
 
 def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
-    """Return the parts of what is believed that are not the world's own: plant, sensor, channel, trigger and others.
+    """Return the names of the parts of which a filter believes something else than what holds where it stands.
 
     Args:
-        believed: what the filter was made for.
-        own: plant, sensor, channel and trigger of the place where it stands, and limits of what it uses.
+        believed: the plant, sensor, channel and so on for which the filter was made.
+        own: those of the network and node in which it stands.
     """
-    # `order`: how much of the noises' laws the filter uses; None for all.
+    # `order`: up to which moments the filter uses the laws of noises; None for the laws as a whole.
     order, own = believed.order, _enlarge_world_by_past(believed, own)
     parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
@@ -57,11 +57,11 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
         return (*parts, SENSOR)
     if not _same_trigger(believed.trigger, own.trigger):
         parts.append(TRIGGER)
-    if own.range is not None:  # what is refused for its value tells of the state
+    if own.range is not None:  # no filter knows it: that a value is refused, for being out of range, tells of the state
         parts.append(RANGE)
     if not are_same(believed.encoder, own.encoder):
         parts.append(ENCODER)
-    # Sensor and channel agree one by one, or in what is received of the state through both.
+    # Sensor and channel agree one by one, or together: what is received of the state through both may be the same.
     sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:

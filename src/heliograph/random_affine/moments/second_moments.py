@@ -166,30 +166,55 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """Return E[(G, n)] under the nominal law, and maps that bound second moments of z = G y + n under all laws.
 
     The maps take W = E[(y, 1) (y, 1)'] to a matrix above the spread E[((G, n) - nominal mean) W (...)'], the shift (the
-    same of the law's mean) and the power E[(G, n) W (G, n)'] without the constant. Exact where the law is known.
+    same of the law's mean) and the power E[G y y' G'], which leaves out the last row and column of W. They are exact
+    where the law is known.
     """
-    # Whether corner laws are few enough to be listed.
     corners = count_corners(channel)
-    listed = corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
-    # Independent maps, added up or side by side: of known laws their spreads are all; else bounded part by part.
-    if isinstance(channel, Superposed | Stack) and corners == 1:
+    # A single corner: nothing is uncertain.
+    if corners == 1:
+        return _take_known_moments(channel)
+    can_list_corners = (
+        corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
+    )
+    return _bound_uncertain_moments(channel, can_list_corners)
+
+
+def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
+    """Return the moments of a channel of known law, which are their own bounds."""
+    # Independent maps, added up or side by side: the covariances of each map alone are all there are.
+    if isinstance(channel, Superposed | Stack):
         mean, tensor = _compute_mean_and_spread(channel)
-        own = map_of_known_law(tensor)
-        of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-        return MomentBounds(mean, own, scale_map(own, 0.0), add_maps(signal_of_map(own), of_mean), own)
-    if isinstance(channel, Superposed) and not listed:
+        spread = map_of_known_law(tensor)
+        power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+        return MomentBounds(
+            mean=mean,
+            spread=spread,
+            shift=scale_map(spread, 0.0),  # no law has another mean
+            power=add_maps(signal_of_map(spread), power_of_mean),
+            nominal=spread,
+        )
+    moments = channel.moments(2)
+    mean = moments.mean[:-1]
+    spread, shift, power = (map_of_known_law(tensor) for tensor in tensors_of_law(moments, mean))
+    spread = map_of_known_law(_drop_known_gain(channel, spread.center))
+    return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=spread)
+
+
+def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bool) -> MomentBounds:
+    """Return bounds of the moments of a channel of uncertain law.
+
+    Args:
+        channel: the channel.
+        can_list_corners: whether the extreme laws (`corner_moments`) are few enough to be gone through one by one.
+    """
+    if isinstance(channel, Superposed) and not can_list_corners:
         return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
-    # Known law: the moments themselves.
-    if corners == 1:
-        spread, shift, power = (map_of_known_law(tensor) for tensor in tensors_of_law(nominal, mean))
-        spread = map_of_known_law(_drop_known_gain(channel, spread.center))
-        return MomentBounds(mean, spread, shift, power, spread)
-    # Uncertain law: blocks of a stack, maxima over corner laws, or intervals of moments.
+    # Bounds from the blocks of a stack, as maxima over the extreme laws, or from intervals of moments.
     if isinstance(channel, Stack):
         parts = _bound_stacked_maps(channel)
-    elif listed:
+    elif can_list_corners:
         laws = [JointMoments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
         # One map above all laws for each of spread, shift and power.
         by_kind = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
@@ -197,7 +222,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     else:
         parts = bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts
-    return MomentBounds(mean, spread, shift, power, nominal_spread(channel))
+    return MomentBounds(mean=mean, spread=spread, shift=shift, power=power, nominal=nominal_spread(channel))
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
@@ -221,9 +246,10 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j', D_i = E H_i - M_i at most the `reach` of part i in each entry. A
     bound is a map with a center, and a radius of each entry.
     """
-    n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
+    n, mean = channel.outputs, channel.moments(1).mean[:-1]
     blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
     reaches = []
+    start = 0  # first output of the part
     for affine in channel.maps:
         stop = start + affine.outputs
         # Diagonal block, and the largest |E[H_i] - M_i| under any law.
@@ -240,7 +266,7 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     reach, size = xp.concatenate(reaches), xp.abs(mean)
     cross = symmetric_product(reach, reach)
     power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)
-    # Of spread, shift and power.
+    # Center and radius of the entries off the diagonal, of spread, shift and power in turn.
     centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
@@ -303,26 +329,37 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
         parts: bounds of each of its maps.
     """
     # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
-    every = range(len(parts))
+    every = range(len(parts))  # numbers of the parts
     mean = channel.in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
-    of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-    own = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
+    power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
+    spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     # Known means: nothing is shifted.
     sizes = [size_of_map(bounds.shift) for bounds in parts]
     total = sum(sizes)
     if is_zero(total):
-        return MomentBounds(mean, own, scale_map(noise, 0.0), add_maps(signal_of_map(own), of_mean), own)
-    inverse = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
-    shift = _sum_maps(channel, {i: (parts[i].shift, weight) for i, weight in inverse.items()})
-    cross = _sum_maps(channel, {i: (parts[i].shift, weight - 1) for i, weight in inverse.items()})
+        return MomentBounds(
+            mean=mean,
+            spread=spread,
+            shift=scale_map(noise, 0.0),
+            power=add_maps(signal_of_map(spread), power_of_mean),
+            nominal=spread,
+        )
+    inverse_weights = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
+    shift = _sum_maps(channel, {i: (parts[i].shift, inverse) for i, inverse in inverse_weights.items()})
+    cross = _sum_maps(channel, {i: (parts[i].shift, inverse - 1) for i, inverse in inverse_weights.items()})
     # Power: of the mean m shifted by d, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
-    mean_size = size_of_map(of_mean)
-    ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)
-    power = add_maps(signal_of_map(own), scale_map(of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio))
-    nominal = add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise)
-    return MomentBounds(mean, add_maps(own, cross), shift, power, nominal)
+    mean_size = size_of_map(power_of_mean)
+    ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)  # d / m
+    widened_mean, widened_shift = scale_map(power_of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio)
+    return MomentBounds(
+        mean=mean,
+        spread=add_maps(spread, cross),
+        shift=shift,
+        power=add_maps(signal_of_map(spread), widened_mean, widened_shift),
+        nominal=add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise),
+    )
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:

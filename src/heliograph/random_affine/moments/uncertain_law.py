@@ -59,19 +59,21 @@ def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray
     size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
     residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
-    # Largest noise matrix: N_max - N_v >= 0 for all v, judged of correlations.
+    # N_max, that of the largest trace. N_max - N_v >= 0 is judged in units in which N_max has ones on its diagonal, so
+    # that the tolerance is relative.
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
     unit = xp.sqrt(xp.diagonal(largest))
     unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
     gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
-    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
-    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
-    corner = np.zeros((mean.shape[1], mean.shape[1]))
-    corner[-1, -1] = 1.0
-    # max_v s_v M y y' M' + N_max.
+    gains_are_multiples = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
+    is_uncorrelated = xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
+    noise_is_largest = xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE
+    # max_v s_v M y y' M' + N_max, the latter as what multiplies the constant 1.
+    constant = np.zeros((mean.shape[1], mean.shape[1]))
+    constant[-1, -1] = 1.0
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
-    exact = widened + largest[:, :, None, None] * corner
-    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
+    dominating = widened + largest[:, :, None, None] * constant
+    return dominating, gains_are_multiples & is_uncorrelated & noise_is_largest
 
 
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
