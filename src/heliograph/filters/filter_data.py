@@ -13,9 +13,9 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
 from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.row_times import common_dates, judge_dates
+from heliograph.model.checks.row_times import check_dates, find_common_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.forecast_origin import KeptOrigin, Origin, last_input, usual_months, usual_spacing
+from heliograph.model.forecast_origin import KeptOrigin, Origin, find_usual_months, find_usual_spacing, last_input
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
@@ -155,7 +155,7 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     before = None if after is None else _find_origin(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
-    dates = common_dates(_name_tables(z, u))
+    dates = find_common_dates(_name_tables(z, u))
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
         _check_later(before, dates)
@@ -193,8 +193,8 @@ def _describe_end(filter: SteppedFilter, state: PyTree, end: int, u: Array, date
         u: inputs (rows, inputs).
         dates: of the rows; None where they have none, and their numbers are their times.
     """
-    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], usual_spacing(dates))
-    months = 0 if dates is None else usual_months(dates)
+    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_usual_spacing(dates))
+    months = 0 if dates is None else find_usual_months(dates)
     return Origin(
         model=filter,
         state=state,
@@ -269,7 +269,7 @@ def check_data(
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
     `begin` rows were before them.
     """
-    judge_dates(filter.inputs, _name_tables(measurements, inputs))
+    check_dates(filter.inputs, _name_tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.

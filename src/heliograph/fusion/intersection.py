@@ -59,9 +59,10 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
         # At the optimum s = g - min g: with a tenth of the trace added, the first multipliers are positive.
         slack = jnp.where(progress.iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
         new_w, new_slack = _take_newton_step(_InteriorPoint(w, slack, gradient, hessian))
-        goes_on = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
-        w, slack = jnp.where(goes_on, new_w, w), jnp.where(goes_on, new_slack, slack)
-        return _Progress(weights=w, slack=slack, goes_on=goes_on, iteration=progress.iteration + 1)
+        # The certificate of the docstring: max_k tr(P J_k P) is above tr P by more than GAP tr P.
+        is_unfinished = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
+        w, slack = jnp.where(is_unfinished, new_w, w), jnp.where(is_unfinished, new_slack, slack)
+        return _Progress(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
 
     def goes_on(progress: _Progress) -> jax.Array:
         """Return whether another step is to be taken."""
@@ -236,21 +237,21 @@ def equal_shares(believed: NeighbourEstimates) -> Shared:
     return intersect_shares(believed, present / present.sum())
 
 
-def trace_shares(believed: NeighbourEstimates, power: float, improvements: int) -> Shared:
-    """Return shares proportional to (tr P_j)^-power, or equal where these give the smaller trace; then improved.
+def choose_shares_by_trace(believed: NeighbourEstimates, power: float, improvements: int) -> Shared:
+    """Return the shares of covariance intersection, and its covariance P, that have the smallest trace tr P found.
 
-    The first alone ignore a neighbour of large variance who alone knows some direction. An improvement multiplies each
-    share by
-    the root of tr(P J_j P) / tr P, P = (sum pi J)^-1, which is 1 at the minimum where the share is positive.
+    Tried are shares in proportion to (tr P_j)^-power and equal ones: the former alone would ignore a neighbour of large
+    variance, even one who alone knows some direction. From the middle of the two, each improvement multiplies each
+    share pi_j by the root of tr(P J_j P) / tr P, P = (sum pi J)^-1, which is 1 at the minimum where pi_j is positive.
 
     Source: Silvey, Titterington and Torsney, An algorithm for optimal designs on a finite design space (1978).
     """
     # Relative to the smallest trace that arrived, so that no power overflows.
     least = jnp.min(jnp.where(believed.present, believed.traces, jnp.inf))
-    powers = jnp.where(believed.present, (least / believed.traces) ** power, 0.0)
+    by_trace = jnp.where(believed.present, (least / believed.traces) ** power, 0.0)
     equal = equal_shares(believed)
-    best = _smaller_trace(intersect_shares(believed, powers / powers.sum()), equal)
-    # A share of zero stays zero, so start inside.
+    best = _smaller_trace(intersect_shares(believed, by_trace / by_trace.sum()), equal)
+    # An improvement leaves a share of zero at zero, so the first shares are all positive.
     shares = (best[0] + equal[0]) / 2
     for _ in range(improvements):
         covariance = intersect_shares(believed, shares)[1]

@@ -8,6 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.fusion.intersection import (
+    choose_shares_by_trace,
     equal_shares,
     intersect_covariances,
     intersect_inverse_covariances,
@@ -15,7 +16,6 @@ from heliograph.fusion.intersection import (
     invert_covariances,
     restore_exact_components,
     trace_optimal_weights,
-    trace_shares,
 )
 from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.fusion.mesh.graph import Graph
@@ -167,7 +167,7 @@ class CovarianceIntersection(AbstractIntersection):
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Intersect with shares that are nearly those of least trace: a few improvements of `TraceIntersection`."""
-        return intersection_weights(believed, trace_shares(believed, POWER, IMPROVEMENTS))
+        return intersection_weights(believed, choose_shares_by_trace(believed, POWER, IMPROVEMENTS))
 
 
 class EqualIntersection(AbstractIntersection):

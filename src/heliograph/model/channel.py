@@ -246,12 +246,14 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
 
 
 def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
-    """Return links of all of the signal, of which each takes its own part."""
-    parts, start, total, past = [], 0, sum(signal_size(c) for c in links), max(c.past for c in links)
-    for c in links:
-        parts.append(place_part(c, total, start, past))
-        start += signal_size(c)
-    return parts
+    """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
+    total, past = sum(signal_size(link) for link in links), max(link.past for link in links)
+    placed = []
+    start = 0  # of the link's part in the signal
+    for link in links:
+        placed.append(place_part(link, total, start, past))
+        start += signal_size(link)
+    return placed
 
 
 def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool = False) -> Superposed:

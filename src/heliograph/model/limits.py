@@ -150,7 +150,10 @@ class Limits(Module):
 
 
 def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
-    """Return whether each number is a code, up to the rounding of a product, or as single precision has it."""
+    """Return whether each number is a code: equal up to the rounding of a product, or as single precision stores it.
+
+    A code is a number that stands for no reading, such as -999.
+    """
     numbers = np.asarray(z, dtype=np.float64)[..., None]
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)

@@ -114,14 +114,23 @@ class AbstractTrigger(Module):
         last = jnp.where(sent & ~arrived, -reason, reason)
         return SenderState(reference, jnp.where(sent, 0, sender.age + 1), sender.begun | renewed, lost, last)
 
-    def transmit(
+    def receive_if_sent(
         self, sender: SenderState, y: jax.Array, z: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[SenderState, jax.Array]:
-        """Return the sender that follows, and what the receiver gets where the channel would make z of y."""
-        reason, there = self.reasons(sender, y, key, k), ~jnp.isnan(z)
-        items = self.region == "each"
-        arrived = there if items else jnp.full(len(y), jnp.any(there))
-        sent = reason > 0 if items else jnp.any(reason > 0)
+        """Return the sender after the step, and what the receiver gets: NaN of what the rule does not send.
+
+        Args:
+            sender: before the step.
+            y: the measurement, of which the rule decides what is sent.
+            z: what the channel would make of y, NaN of what it would lose.
+            key: random, for rules that draw.
+            k: the step.
+        """
+        reason, is_present = self.reasons(sender, y, key, k), ~jnp.isnan(z)
+        # Components are sent one by one, or all in one message.
+        one_by_one = self.region == "each"
+        arrived = is_present if one_by_one else jnp.full(len(y), jnp.any(is_present))
+        sent = reason > 0 if one_by_one else jnp.any(reason > 0)
         received = jnp.concatenate([jnp.where(sent, z, jnp.nan), self.known_losses(sender, reason, arrived)])
         return self.after(sender, y, reason, arrived), received
 

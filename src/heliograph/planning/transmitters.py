@@ -17,7 +17,7 @@ from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.traced import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Bool, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import stationary
+from heliograph.random_affine.chain import find_stationary_law
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
@@ -86,7 +86,7 @@ def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict
     """
     joint = joint_modes(channel, order=2)
     unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
-    return compute_powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))
+    return compute_powers_of_law(channel, second, joint.initial if unchanged else find_stationary_law(joint.transition))
 
 
 def compute_powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:

@@ -155,7 +155,9 @@ class MarkovChain(AbstractMemory):
         for i, row in enumerate(rows):
             probabilities(f"transition from mode {i}", row)
         self.radius = radii("radius of the transition", radius, rows)
-        self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
+        self.initial = (
+            find_stationary_law(rows) if initial is None else probabilities("initial law", initial, len(rows))
+        )
         self.name, self.identity = name, identify_memory(name)
 
     @property
@@ -286,7 +288,7 @@ class Autoregression(AbstractMemory):
         )
 
 
-def stationary(transition: Rows) -> Law:
+def find_stationary_law(transition: Rows) -> Law:
     """Return the law p = p Pi of a chain that has only one; ValueError of one that has several."""
     m = len(transition)
     xp = library(transition)

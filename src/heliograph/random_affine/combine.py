@@ -324,14 +324,16 @@ def multiply_moments_of_parts(
     """
     variables, rows = channel.inputs + 1, []
     for powers in list_exponents(channel.outputs + 1, order):
-        polynomial, degree, start = np.ones(1), 0, 0
-        for m, table in zip(channel.maps, tables, strict=True):
-            # The powers of this part's outputs, and its polynomial of them.
-            a = powers[start : start + m.outputs]
-            start, k = start + m.outputs, sum(a)
-            if k:
-                factor = table[k][..., position(m.outputs + 1, k)[(*a, 0)], :]
-                polynomial, degree = times(polynomial, degree, factor, k, variables), degree + k
+        polynomial, degree = np.ones(1), 0
+        start = 0  # first output of the part
+        for part, table in zip(channel.maps, tables, strict=True):
+            # The powers of this part's outputs, their sum, and the part's polynomial of them; 1 where all are 0.
+            a = powers[start : start + part.outputs]
+            start, degree_of_part = start + part.outputs, sum(a)
+            if degree_of_part:
+                factor = table[degree_of_part][..., position(part.outputs + 1, degree_of_part)[(*a, 0)], :]
+                polynomial = times(polynomial, degree, factor, degree_of_part, variables)
+                degree += degree_of_part
         # Times 1^(order - |a|), so that all rows have the degree `order`.
         power_of_one = np.zeros(count_monomials(variables, powers[-1]))
         power_of_one[-1] = 1.0

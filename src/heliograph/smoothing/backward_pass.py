@@ -72,7 +72,7 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
     return steps
 
 
-def sweep_back(steps: SmootherStep) -> Estimate:
+def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
     """Estimate each step's state given all data: one backward pass."""
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
@@ -87,7 +87,7 @@ def sweep_back(steps: SmootherStep) -> Estimate:
     return _append_last(earlier, last.estimate_from(last.end))
 
 
-def sweep_means(steps: SmootherStep) -> jax.Array:
+def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
     """Estimate the mean of each step's state given all data: one backward pass."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
@@ -102,7 +102,7 @@ def sweep_means(steps: SmootherStep) -> jax.Array:
     return _append_last(earlier, _take_plant_mean(last, end))
 
 
-def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
+def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
     last = len(steps.mean) - 1
     times = jnp.arange(last + 1)
@@ -123,7 +123,7 @@ def sweep_over_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     return estimate
 
 
-def carry_ahead(steps: SmootherStep, step: int) -> Estimate:
+def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state after one step given the data up to it, and up to each later one."""
     start = take_step(steps, step)
 

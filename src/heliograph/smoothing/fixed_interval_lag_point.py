@@ -16,7 +16,12 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, Float
-from heliograph.smoothing.backward_pass import carry_ahead, sweep_back, sweep_means, sweep_over_lag
+from heliograph.smoothing.backward_pass import (
+    smooth_fixed_interval,
+    smooth_fixed_interval_means,
+    smooth_fixed_lag,
+    smooth_fixed_point,
+)
 
 BLOCKS = 10  # parts of a run, whose scatter gives the standard error of the NIS
 DEVIATIONS = 3.5  # standard errors of the mean NIS: fewer may be chance
@@ -110,11 +115,11 @@ class FixedInterval(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time, ...)."""
-        return sweep_back(steps)
+        return smooth_fixed_interval(steps)
 
     def means(self, steps: SmootherStep) -> jax.Array:
         """Return the means (time, ...)."""
-        return sweep_means(steps)
+        return smooth_fixed_interval_means(steps)
 
 
 class FixedLag(AbstractSmoothing):
@@ -134,7 +139,7 @@ class FixedLag(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time, ...)."""
-        return sweep_over_lag(steps, self.lag)
+        return smooth_fixed_lag(steps, self.lag)
 
 
 class FixedPoint(AbstractSmoothing):
@@ -154,7 +159,7 @@ class FixedPoint(AbstractSmoothing):
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time from that step on, ...)."""
-        return carry_ahead(steps, self.step)
+        return smooth_fixed_point(steps, self.step)
 
     def select_reference(self, values: A) -> A:
         """Repeat the value at that step, once per estimate of it."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.fusion.intersection import intersection_weights, trace_shares
+from heliograph.fusion.intersection import choose_shares_by_trace, intersection_weights
 from heliograph.fusion.mesh.gains import (
     NeighbourEstimates,
     NeighbourWeights,
@@ -54,11 +54,11 @@ class TraceIntersection(AbstractIntersection):
         """Return the shares of all of several estimates."""
         traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
         believed = NeighbourEstimates(covariances[0], traces, information, None, all_there)
-        return trace_shares(believed, self.power, self.improvements)[0]
+        return choose_shares_by_trace(believed, self.power, self.improvements)[0]
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
         """Find the weights by which a node intersects what arrived from its neighbours."""
-        return intersection_weights(believed, trace_shares(believed, self.power, self.improvements))
+        return intersection_weights(believed, choose_shares_by_trace(believed, self.power, self.improvements))
 
 
 class _NeighbourRule(AbstractFusion):

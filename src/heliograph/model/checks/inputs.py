@@ -273,13 +273,16 @@ def _is_spoilt(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: t
 def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:
     """Decide whether a matrix (n, n) is a covariance, by elimination of its correlations.
 
-    It has to be finite and symmetric, without a pivot below zero.
+    It has to be finite and symmetric, without a pivot below zero. Where a pivot is zero, nothing may be left of its
+    column: |c_ij|^2 <= c_ii c_jj.
 
-    Where a pivot is zero, nothing may be left of its column: |c_ij|^2 <= c_ii c_jj.
+    Args:
+        matrix: (n, n).
+        precision: type of numbers whose rounding is allowed; None for the matrix's own.
     """
     variances = jnp.diagonal(matrix)
     scale = 1 / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
-    left = matrix * scale[:, None] * scale
+    left = matrix * scale[:, None] * scale  # what elimination has left of the correlations
     like: Array = left if precision is None else np.zeros(0, precision)
     sound = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
     sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, like))

@@ -14,7 +14,7 @@ from heliograph.numerics.times.row_times import row_dates
 ONE_STEP = "a plant without the input dt takes each for one; insert the rows that are missing, or give it dt"
 
 
-def common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
+def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
     """Return the dates in the index of tables (datetime64[ns], UTC), which must agree; None where no table has any.
 
     Args:
@@ -47,8 +47,8 @@ def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> No
         warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_find_caller())
 
 
-def judge_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
-    """Return the dates by which the rows of tables are known, and warn where their steps differ unsaid.
+def check_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
+    """Return the dates of the rows of tables; warn where their steps differ and the plant has no input dt to say so.
 
     Args:
         inputs: names of the plant's inputs.
@@ -57,7 +57,7 @@ def judge_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarr
     Raises:
         ValueError: dates that are missing, that go backwards, or that differ from those of another table.
     """
-    clock = common_dates(tables)
+    clock = find_common_dates(tables)
     warn_of_unequal_steps(inputs, clock)
     return clock
 

@@ -27,7 +27,7 @@ from heliograph.planning.numbers.mode_riccati import ModeSystem
 from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.transmitters import compute_powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import stationary
+from heliograph.random_affine.chain import find_stationary_law
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.memory import memories
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
@@ -261,7 +261,7 @@ def _propagate_laws(
     leads to the first; else they go from the initial law on, whatever was before.
     """
     over_period = reduce(jnp.matmul, onward)
-    law = [stationary(over_period) if forever and len(over_period) > 1 else jnp.asarray(initial)]
+    law = [find_stationary_law(over_period) if forever and len(over_period) > 1 else jnp.asarray(initial)]
     for step in onward[:-1]:
         law.append(law[-1] @ step)
     into_first = onward[-1] if forever else jnp.tile(law[0], (len(law[0]), 1))
