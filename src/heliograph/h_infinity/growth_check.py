@@ -355,19 +355,20 @@ def _sharpen_bound(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
     """Return the largest bound of a slope, after halving boxes whose bound is above the goal, LIMIT boxes at most."""
-    # done: the largest bound of the boxes that are within the goal; seen: how many were looked at.
-    bottoms, tops, done, seen = low[None], high[None], 0.0, 0
+    bottoms, tops = low[None], high[None]
+    largest_within = 0.0  # bound of the boxes that are within the goal
+    boxes_seen = 0
     while len(bottoms):
         bounds = np.concatenate(
             [_bound_slopes(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
         )
-        seen += len(bottoms)
+        boxes_seen += len(bottoms)
         undecided = bounds > goal
-        done = max(done, float(np.max(bounds[~undecided], initial=0.0)))
-        if seen + 2 * np.count_nonzero(undecided) > LIMIT:
-            return max(done, float(np.max(bounds)))
+        largest_within = max(largest_within, float(np.max(bounds[~undecided], initial=0.0)))
+        if boxes_seen + 2 * np.count_nonzero(undecided) > LIMIT:
+            return max(largest_within, float(np.max(bounds)))
         bottoms, tops = _halve_boxes(bottoms[undecided], tops[undecided], high - low)
-    return done
+    return largest_within
 
 
 def _bound_slopes(

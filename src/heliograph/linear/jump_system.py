@@ -153,6 +153,7 @@ def _place_in_triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."],
     A unit matrix has one of these entries, and its mirror image, at 1 and all else at zero.
     """
     where = np.nonzero(np.triu(np.ones(shape)))
+    mirrored = *where[:-2], where[-1], where[-2]
     places = np.empty(shape, dtype=int)
-    places[where] = places[*where[:-2], where[-1], where[-2]] = np.arange(len(where[0]))
+    places[where] = places[mirrored] = np.arange(len(where[0]))
     return places, where, np.eye(len(where[0]))[:, places]

@@ -107,17 +107,23 @@ def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
 def _propagate_modes(
     move: Moments, rows: np.ndarray, moments: np.ndarray
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
-    """Return F, Cov(w) and E[y~+ y~+' 1{j}] of one step.
+    """Return F, Cov(w) and E[y~+ y~+' 1{j}] of one step, in the notation of `modal_system`.
 
-    `move` holds the maps' moments by mode, `rows` the chain's transition, `moments` E[y~ y~' 1{i}].
+    Args:
+        move: moments of the maps by mode.
+        rows: Pi, the chain's transition.
+        moments: E_i = E[y~ y~' 1{i}] before the step.
     """
     mean, spread = move
     modes, size = len(moments), moments.shape[-1]
+    # E H_j of y~ = (y, 1): the mean maps with a last row that keeps the 1.
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
+    # sum_i Pi_ij E_i, and what the randomness of the maps makes of it.
     before = mix_modes(rows, moments)
-    added = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
-    chosen = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
-    apart = np.einsum("ijl,jac,icd,lbd->jalb", chosen, whole, moments, whole)
-    apart[np.arange(modes), :, np.arange(modes), :] += added
+    of_random_maps = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
+    # Cov(w)[j, l]: Pi_ij (delta_jl - Pi_il) is the covariance of the indicators of the next modes j and l, given i.
+    indicators = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
+    process = np.einsum("ijl,jac,icd,lbd->jalb", indicators, whole, moments, whole)
+    process[np.arange(modes), :, np.arange(modes), :] += of_random_maps
     transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
-    return transition, apart.reshape(modes * size, modes * size), propagate_by_mode(whole, before, added)
+    return transition, process.reshape(modes * size, modes * size), propagate_by_mode(whole, before, of_random_maps)

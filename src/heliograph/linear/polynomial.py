@@ -73,7 +73,7 @@ def quadratic_system_with_linear_estimate(
     for k, route in enumerate(make_step_maps(plant, sensor, channel, 4, horizon)):
         # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
         move = cache.make_move_map(route.plant, m)
-        measure_squares, measure_fourth = cache.append_measurement(route.measurement, n)
+        measure_squares, measure_fourth = cache.make_measurement_moments(route.measurement, n)
         update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
         # E[Y+ | Y] = M Y with M = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
         transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
@@ -108,27 +108,29 @@ class _MomentCache:
     """Moments of plant and link for the quadratic system, computed again only where the model changes."""
 
     def __init__(self) -> None:
+        # The plant's noise of the last step, and that of (x+, q) made of it; the last measurement, and its moments.
         self.noise: AbstractNoise | None = None
-        self.joint: AbstractNoise | None = None
+        self.joint_noise: AbstractNoise | None = None
         self.route: AbstractRandomAffine | None = None
-        self.wide: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
+        self.moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
         """Return the map (x, q, z) -> (x+, q) of a plant's step, q being n numbers and z m."""
         n = plant.inputs
-        if self.joint is None or plant.noise is not self.noise:
-            still = Gaussian(np.zeros((n, n)))
-            self.noise, self.joint = plant.noise, TabulatedNoise(Independent([plant.noise, still]), 4)
+        if self.joint_noise is None or plant.noise is not self.noise:
+            no_noise = Gaussian(np.zeros((n, n)))
+            self.noise, self.joint_noise = plant.noise, TabulatedNoise(Independent([plant.noise, no_noise]), 4)
         matrix = np.zeros((2 * n, 2 * n + m))
         matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
-        return GainAndNoise(Constant(1.0), matrix, self.joint)
+        return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
-    def append_measurement(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the moments of order 2 and 4 of (x+, q, z+) from those of (x+, q)."""
+    def make_measurement_moments(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q)."""
         if route is not self.route:
-            wide = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
-            self.route, self.wide = route, (np.asarray(wide.moments(2).matrix), np.asarray(wide.moments(4).matrix))
-        return self.wide
+            appended = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
+            self.route = route
+            self.moments = np.asarray(appended.moments(2).matrix), np.asarray(appended.moments(4).matrix)
+        return self.moments
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:

@@ -158,22 +158,24 @@ class GainAndNoise(AbstractHop):
         return rows
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the outputs that take one angle each by a gain of 1, and with it whole numbers of turns."""
+        """Return the outputs that are angles: those that take one angle by a gain of 1, and nothing else."""
         if not sent:
             return ()
         if is_traced(self.matrix):
             raise refuse_gain_on_angles("a gain that is traced")
-        touched = np.flatnonzero(np.any(np.asarray(self.matrix)[:, list(sent)] != 0, axis=1))
-        if not touched.size:
+        # Outputs that take an angle.
+        taking = np.flatnonzero(np.any(np.asarray(self.matrix)[:, list(sent)] != 0, axis=1))
+        if not taking.size:
             return ()
         gain = self.law.constant
         if gain is None or is_traced(gain):
             raise refuse_gain_on_angles(f"a gain that is {type(self.law).__name__}")
-        rows = float(gain) * np.asarray(self.matrix)[touched]
-        whole = np.abs(rows - np.round(rows)) <= ROUNDING
-        if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
-            raise refuse_gain_on_angles(f"the gains {rows[rows != 0].tolist()}")
-        return tuple(int(i) for i in touched)
+        # Gains of 0 or more that are whole and sum to 1: a single one that is 1.
+        gains = float(gain) * np.asarray(self.matrix)[taking]
+        are_whole = np.abs(gains - np.round(gains)) <= ROUNDING
+        if not np.all(are_whole & (np.round(gains) >= 0)) or np.any(np.round(gains).sum(axis=1) != 1):
+            raise refuse_gain_on_angles(f"the gains {gains[gains != 0].tolist()}")
+        return tuple(int(i) for i in taking)
 
     def list_atoms(self) -> list[AffineComponent]:
         """Combine every gain with every noise."""
@@ -188,18 +190,20 @@ class GainAndNoise(AbstractHop):
     def in_words(self) -> str:
         """Return the hop in words, such as "Rician hop", "hop 1.1" or "known gain 1.1"; "" if it passes y as it is."""
         matrix = np.asarray(self.matrix)
-        silent = not (np.any(np.asarray(self.noise.covariance)) or np.any(np.asarray(self.noise.mean)))
+        is_noiseless = not (np.any(np.asarray(self.noise.covariance)) or np.any(np.asarray(self.noise.mean)))
         if not matrix.any():
             return NOTHING_SENT
-        diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
+        is_square = matrix.shape[0] == matrix.shape[1]
+        is_multiple_of_identity = is_square and np.array_equal(matrix, matrix[0, 0] * np.eye(len(matrix)))
         if self.law.constant is None:
             return f"{type(self.law).__name__} hop"
-        gain = float(self.law.constant) * matrix[0, 0] if diagonal else np.nan
+        gain = float(self.law.constant) * matrix[0, 0] if is_multiple_of_identity else np.nan
+        # Each output is one of the inputs.
         selects = float(self.law.constant) == 1 and np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
-        if silent and (gain == 1 or selects):
+        if is_noiseless and (gain == 1 or selects):
             return ""
-        kind = "known gain" if silent else "hop"
-        return f"{kind} {gain:.3g}" if diagonal and gain != 1 else kind
+        kind = "known gain" if is_noiseless else "hop"
+        return f"{kind} {gain:.3g}" if is_multiple_of_identity and gain != 1 else kind
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Take the noise away where its law has outliers."""

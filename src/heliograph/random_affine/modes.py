@@ -251,9 +251,8 @@ def joint_modes(
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    largest = reduce(
-        xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1))
-    )  # each at its most
+    # The largest that each joint transition may be: the product of the largest ones.
+    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
     # The state of each memory in each joint mode, and the maps given these.
     by_mode = [
         dict(zip(held, [state.item() for state in states], strict=True))
@@ -323,16 +322,19 @@ def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant
     law must be that of all steps, and lags up to the number of modes decide, since Pi^t is a combination of lower
     powers (Cayley-Hamilton).
     """
-    items = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
+    # A step that does not vary stands for itself and as many later ones as there are modes.
+    repeated = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
     if constant and not np.allclose(steps[0].initial @ steps[0].transition, steps[0].initial, rtol=0, atol=ROUNDING):
         return False
+    # Hbar of each step, its entries in a row for each mode.
     means = [np.array([np.asarray(m.moments(1).mean[:-1]).ravel() for m in step.maps]) for step in steps]
-    means = means * len(items) if constant else means
+    means = means * len(repeated) if constant else means
     size = max(float(np.max(np.abs(m))) for m in means) ** 2
-    starts = 1 if constant else len(items)
-    for k, law in enumerate(mode_laws_over_time(items)[:starts]):
+    # Pairs (k, l) of steps: of what does not vary only the lag counts, so k = 0 is enough.
+    first_steps = 1 if constant else len(repeated)
+    for k, law in enumerate(mode_laws_over_time(repeated)[:first_steps]):
         deviations = law[:, None] * (means[k] - law @ means[k])
-        for step, later in zip(items[k:-1], means[k + 1 :], strict=True):
+        for step, later in zip(repeated[k:-1], means[k + 1 :], strict=True):
             deviations = np.asarray(step.transition).T @ deviations
             if np.max(np.abs(deviations.T @ later)) > ROUNDING * size:
                 return False

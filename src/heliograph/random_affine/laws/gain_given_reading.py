@@ -142,15 +142,22 @@ def _find_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.
 
 
 def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
-    """Return a place from which to `outer` the density is below `least`, and close to where it rises above it."""
+    """Return a place near the one where the density rises above `least`, on its side towards `outer`.
+
+    Args:
+        log_density: logarithm of a density with one mode.
+        outer: an end of the interval, where the density is below `least`.
+        mode: where the density is largest.
+        least: the logarithm to find.
+    """
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Return the cell of a grid in which the density rises above `least`, from the outer end to the inner one."""
         outside, inside = ends
         points = outside + (inside - outside) * steps
-        counts = (jax.vmap(log_density)(points) > least).at[-1].set(True)
-        first = jnp.argmax(counts)
+        is_above = (jax.vmap(log_density)(points) > least).at[-1].set(True)
+        first = jnp.argmax(is_above)  # the first that is
         return points[jnp.maximum(first - 1, 0)], points[first]
 
     outside: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, mode))[0]

@@ -184,8 +184,8 @@ class Discrete(AbstractLaw):
         high = np.minimum(self.probabilities + self.radius, 1.0)
         mass, total = 1.0 - low.sum(), float(low @ gain)
         for i in np.argsort(-gain, kind="stable"):
-            step = min(mass, high[i] - low[i])
-            total, mass = total + step * gain[i], mass - step
+            added = min(mass, high[i] - low[i])
+            total, mass = total + added * gain[i], mass - added
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
@@ -212,7 +212,7 @@ class Discrete(AbstractLaw):
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
         """
         free = np.flatnonzero(self.radius > 0)
-        if len(free) < 2:  # a single uncertain probability cannot move: the others hold the sum
+        if len(free) < 2:  # a single uncertain probability cannot move: the known ones leave it the rest of the sum 1
             return self.probabilities[None]
         if len(free) > CORNER_LIMIT:
             raise fail("uncertain probabilities of one gain", f"at most {CORNER_LIMIT}", len(free))
