@@ -110,9 +110,9 @@ def h_infinity_filter(
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
     _check_sizes(plant, sensor, system, design)
-    start, outputs = first(plant), system.output.shape[1]
+    plant_0, outputs = first(plant), system.output.shape[1]
     shape = (system.states,)
-    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, shape)
+    mean = plant_0.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, shape)
     # E[G], by which the filter predicts z; the other columns of the channel's mean belong to its own disturbances.
     expected_gain = np.array([link.mean[:, :outputs] for link in system.channel])
     return HInfinityFilter(
@@ -121,16 +121,16 @@ def h_infinity_filter(
         gains=OverTime(design.gains),
         expected_gain=OverTime(expected_gain),
         initial_mean=mean,
-        **make_sizes("none", start, system.received),
+        **make_sizes("none", plant_0, system.received),
     )
 
 
 def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign) -> None:
     """Raise ValueError unless plant, sensor, system and design fit each other, without attitudes and angles."""
-    start = instance("plant", first(plant), AbstractPlant, "a plant")
-    if start.attitude:
-        raise fail("plant of an H-infinity filter", WITHOUT_ATTITUDE, list(start.attitude))
-    n, outputs = len(start.states), system.output.shape[1]
+    plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
+    if plant_0.attitude:
+        raise fail("plant of an H-infinity filter", WITHOUT_ATTITUDE, list(plant_0.attitude))
+    n, outputs = len(plant_0.states), system.output.shape[1]
     if n != system.states or design.gains.shape != (system.steps, n, system.received):
         raise fail("system", f"{n} states and gains {design.gains.shape}", f"{system.states} states")
     check_sensor(first(sensor), n)

@@ -189,11 +189,11 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     Source: quadratic filtering with dynamical bias, equations (11) to (13) and Lemmas 3 and 4, as repaired.
     """
     check_model(plant, sensor, channel)
-    start = first(plant)
-    n, m = len(start.states), int(first(channel).outputs)
+    plant_0 = first(plant)
+    n, m = len(plant_0.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
     routes = make_step_maps(plant, sensor, channel, 2 * degree, horizon)
-    moments = initial_monomial_moments(start, 2 * degree)
+    moments = initial_monomial_moments(plant_0, 2 * degree)
     premise = Premise(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
         return on_premise(_lift_chain(routes, degree, moments, (n, m)), premise)

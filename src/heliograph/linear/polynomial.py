@@ -56,8 +56,8 @@ def quadratic_system_with_linear_estimate(
         ValueError: a schedule of another shape, or what `lifted_system` refuses.
     """
     check_model(plant, sensor, channel)
-    start, horizon = first(plant), linear.horizon
-    n, m = len(start.states), int(first(channel).outputs)
+    plant_0, horizon = first(plant), linear.horizon
+    n, m = len(plant_0.states), int(first(channel).outputs)
     if linear.gains.gain.shape[1:] != (n, m):
         raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
     total = 2 * n + m
@@ -65,7 +65,7 @@ def quadratic_system_with_linear_estimate(
     # At the start (x_0, q_0, 0), q_0 a known number: an affine function of x_0. Moments up to order 4, of which
     # `second` = E[Y Y'] of the products Y up to degree 2.
     start_map = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
-    moments = push_through_known_map(start_map, 4, initial_monomial_moments(start, 4))
+    moments = push_through_known_map(start_map, 4, initial_monomial_moments(plant_0, 4))
     second = products_of_monomials(moments, total + 1, 2)
     mean, spread = mean_and_spread(second)
     received, cache = _make_received_products(n, m), _MomentCache()

@@ -89,11 +89,11 @@ def expected_signal(
         ValueError: a horizon beyond what varies over time, a sensor that does not fit, inputs of another shape.
     """
     check_horizon(horizon, steps_covered((plant, sensor)))
-    start = check_plant(plant)
-    check_sensor(first(sensor), len(start.states))
-    if inputs is None and start.inputs:
-        raise fail("inputs", f"an array ({horizon}, {len(start.inputs)}) of {list(start.inputs)}", "none")
-    shape = (horizon, len(start.inputs))
+    plant_0 = check_plant(plant)
+    check_sensor(first(sensor), len(plant_0.states))
+    if inputs is None and plant_0.inputs:
+        raise fail("inputs", f"an array ({horizon}, {len(plant_0.inputs)}) of {list(plant_0.inputs)}", "none")
+    shape = (horizon, len(plant_0.inputs))
     u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
     return np.asarray(_predict_outputs(plant, sensor, u))
 

@@ -353,10 +353,10 @@ def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
 
 def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Angles:
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
-    start = first(plant)
-    senses = first(sensor).typical(start.inputs)
+    plant_0 = first(plant)
+    senses = first(sensor).typical(plant_0.inputs)
     for model in models_of(senses):
-        check_turns("sensor of a plant", model.measure, start.initial_mean, start.manifold, Manifold(senses.angles))
+        check_turns("sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(senses.angles))
     steps = unstack(channel) if senses.circular else [first(channel)]
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:

@@ -64,10 +64,10 @@ def read_state_limits(
         given = dict(limits)
     except (TypeError, ValueError):
         raise fail("limits of states", expected, show_value(limits)) from None
-    free = [str(name) for name in states if name not in circular]
+    no_angles = [str(name) for name in states if name not in circular]
     for name in given:
-        if name not in free:
-            raise fail("limits of states", f"names of states that are no angles, {free}", show_value(name))
+        if name not in no_angles:
+            raise fail("limits of states", f"names of states that are no angles, {no_angles}", show_value(name))
     # Each interval holds the initial mean; infinite ones are left out.
     read = []
     for name in (name for name in states if name in given):

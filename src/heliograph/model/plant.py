@@ -394,7 +394,7 @@ def check_shape(name: str, called: Callable[..., object], values: tuple[object, 
 
 def check_plant(plant: AnyPlant) -> Any:
     """Return the plant at its first step."""
-    start = instance("plant", first(plant), AbstractPlant, "a plant")
-    if isinstance(start.noise, AbstractNoise):
-        _ = start.noise.covariance  # refused where it does not exist
-    return start
+    plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
+    if isinstance(plant_0.noise, AbstractNoise):
+        _ = plant_0.noise.covariance  # refused where it does not exist
+    return plant_0

@@ -59,8 +59,8 @@ def find_long_silences(
         inputs: of the plant (steps, inputs).
         names: of the inputs.
     """
-    # Time at each row: the sum of dt, or the row's number.
     found = dict[str, LongSilences]()
+    # Time at each row: the sum of dt, or the row's number.
     clock = np.cumsum(inputs[:, names.index(TIME_STEP)]) if TIME_STEP in names else np.arange(len(inputs), dtype=float)
     for node, z in measurements.items():
         timeout = timeouts[node]

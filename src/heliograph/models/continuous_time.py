@@ -96,8 +96,8 @@ class ContinuousSystem(Module):
             for _ in range(int(count)):
                 parts = _double_step(*parts)
         growth, squared, integral, noise = parts
-        # F: I + (F - I) loses what is small beside 1; the squared F is off by 2^count roundings of 1. The latter where
-        # F is so small that it is the better one.
+        # There are two answers for F. I + (F - I) loses what is small beside 1, while the squared F is off by 2^count
+        # roundings of itself: it is the better one where F is small enough.
         decayed = xp.max(xp.abs(squared)) * 2**count < 1
         matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)
         return Discretized(matrix, (noise + noise.T) / 2, integral @ self.b)
@@ -136,14 +136,14 @@ def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[A
 def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
     """Return the turn of a loop that doubles `count` times and then leaves all as it is."""
 
-    def turn(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    def double_if_left(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
         """Double the parts if i is below the count."""
         # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
         doubled = _double_step(*(jnp.where(goes_on, part, 0.0) for part in parts))
         return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, parts, strict=True))
 
-    return turn
+    return double_if_left
 
 
 def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:

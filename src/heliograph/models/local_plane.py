@@ -52,7 +52,7 @@ class LocalPlane(Module):
     @property
     def _origin(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the origin's distance from the axis and height over the equator's plane, as arrays."""
-        return _meridian(np.radians(self.latitude), self.height)
+        return _locate_on_meridian(np.radians(self.latitude), self.height)
 
     def to_plane(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Float[np.ndarray, "*points 3"]:
         """Return east, north and up of points, in metres; NaN where a coordinate is NaN.
@@ -65,7 +65,7 @@ class LocalPlane(Module):
         Raises:
             ValueError: shapes that do not fit, or a latitude beyond 90 degrees (longitude and latitude exchanged?).
         """
-        phi, turn, rise = self._differences(latitude, longitude, height)
+        phi, turn, rise = self._subtract_origin(latitude, longitude, height)
         radius, _ = self._origin
         across, along = _meridian_difference(np.radians(self.latitude), self.height, phi, rise)
         # The meridian's plane turned by the difference in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2).
@@ -91,7 +91,7 @@ class LocalPlane(Module):
         distance = np.hypot(east, radius + out)
         across = (east**2 + 2 * radius * out + out**2) / (distance + radius)
         turn = np.arctan2(east, radius + out)
-        phi, rise = self._newton(across, along)
+        phi, rise = self._find_latitude_and_height(across, along)
         longitude = _wrap(self.longitude + np.degrees(turn))
         return np.stack([self.latitude + np.degrees(phi), longitude, self.height + rise], axis=-1)
 
@@ -140,13 +140,15 @@ class LocalPlane(Module):
         Raises:
             ValueError: arrays of another shape, or a latitude beyond 90 degrees.
         """
-        phi, turn, _ = self._differences(latitude, longitude, self.height)
+        phi, turn, _ = self._subtract_origin(latitude, longitude, self.height)
         matrix = _read_array("covariance of positions", covariance, 3, 3)
-        axes = _axes(np.radians(self.latitude) + phi, turn)  # rows east, north, up; columns out, east, along the axis
-        T = _axes(np.radians(self.latitude), 0.0) @ np.swapaxes(axes, -1, -2)
+        axes = _make_axes(
+            np.radians(self.latitude) + phi, turn
+        )  # rows east, north, up; columns out, east, along the axis
+        T = _make_axes(np.radians(self.latitude), 0.0) @ np.swapaxes(axes, -1, -2)
         return np.asarray(T @ matrix @ np.swapaxes(T, -1, -2))
 
-    def _differences(
+    def _subtract_origin(
         self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what points differ by from the origin: radians, radians from -pi to pi, metres."""
@@ -173,7 +175,7 @@ class LocalPlane(Module):
         east, north, up = np.moveaxis(points, -1, 0)
         return east, c * up - s * north, s * up + c * north
 
-    def _newton(self, across: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find_latitude_and_height(self, across: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return differences in latitude (radians) and height of a point that lies so far from the origin.
 
         The Jacobian of (r, z) by (lat, h) is a rotation with (M + h) beside it, so a Newton step is one turn of what
@@ -202,7 +204,7 @@ def _read_array(name: str, value: ArrayLike, *last: int) -> np.ndarray:
     return np.asarray(array(name, value, (*(None for _ in range(free)), *last), missing=True))
 
 
-def _meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray, np.ndarray]:
+def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance from the axis r = (N + h) cos lat, and z = (N (1 - e^2) + h) sin lat."""
     normal = SEMI_MAJOR / np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     above = normal * (1 - SQUARED_ECCENTRICITY) + height
@@ -240,7 +242,7 @@ def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.asarray(np.arctan2(top, r - SQUARED_ECCENTRICITY * SEMI_MAJOR * np.cos(beta) ** 3))
 
 
-def _axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
+def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
     """Return east, north, up at points as rows, in coordinates out, east and along (the earth's axis) at the origin."""
     c, s, cl, sl = np.cos(latitude), np.sin(latitude), np.cos(turn), np.sin(turn)
     c, s, cl, sl = np.broadcast_arrays(c, s, cl, sl)

@@ -61,7 +61,7 @@ class _DenseInverseHessian:
 
     def __init__(self, gradient: np.ndarray):
         self.matrix = np.eye(len(gradient)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
-        self.first = True
+        self.is_first_update = True
 
     def times(self, vector: np.ndarray) -> np.ndarray:
         """Return H v; steepest descent where -H v is no direction of descent."""
@@ -74,11 +74,11 @@ class _DenseInverseHessian:
 
         H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
         """
-        curvature, first = float(s @ y), self.first
-        self.first = False
+        curvature, is_first = float(s @ y), self.is_first_update
+        self.is_first_update = False
         if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):
             return
-        if first:
+        if is_first:  # in place of the guess, I at the curvature that this step has shown
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
         left = np.eye(len(s)) - np.outer(s, y) / curvature
         self.matrix = left @ self.matrix @ left.T + np.outer(s, s) / curvature

@@ -127,26 +127,26 @@ def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     for name, clock in clocks.items():
         instance(f"clock of {name!r}", clock, Clock, "a Clock")
         means += [scalar(f"delay of the clock of {name!r}", clock.delay), 0.0]
-        offset_deviation, drift_deviation, wander = (
+        offset_deviation, drift_deviation, wander_of_clock = (
             scalar(f"{field} of the clock of {name!r}", getattr(clock, field), 0.0)
             for field in ("offset", "drift", "wander")
         )
         variances += [offset_deviation**2, drift_deviation**2]
-        wanders.append(wander)
+        wanders.append(wander_of_clock)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
     mean, variance, wander = (library(x).asarray(library(x).stack(x)) for x in (means, variances, wanders))
-    each, xp = np.eye(len(clocks)), library(variance, wander)
+    one_each, xp = np.eye(len(clocks)), library(variance, wander)
     start, strength = xp.diag(variance), xp.diag(wander)
     # Steps of one length.
     if not isinstance(dt, str):
         noise = xp.kron(strength, np.diag([0.0, 1.0]))
-        return LinearPlant(np.kron(each, [[1.0, dt], [0.0, 1.0]]), noise, mean, start, states=states)
+        return LinearPlant(np.kron(one_each, [[1.0, dt], [0.0, 1.0]]), noise, mean, start, states=states)
 
     # Steps of a length that an input says: the integral of white noise in the drift, and of that in the offset.
     def matrix_over(u: jax.Array) -> jax.Array:
         """Return the transition matrix over a step of length u[0]."""
-        return jnp.kron(each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
+        return jnp.kron(one_each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
 
     def noise_over(u: jax.Array) -> jax.Array:
         """Return the noise's covariance over a step of length u[0]."""

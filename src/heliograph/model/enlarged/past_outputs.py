@@ -53,17 +53,18 @@ def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     c = sensor.matrix
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
-    length = past * m
+    length = past * m  # of the older outputs together
     # Blocks of rows: x+ (n), y+ (m), older outputs (past m). Columns of x, and of the outputs, of which y_k, ...,
     # y_{k-past+1} move on by one place.
     from_state = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
     from_line = np.concatenate([np.zeros((n + m, length + m)), np.eye(length, length + m)])
-    driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
+    input_matrix = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
     # (w, v) enters x+ and y+ = C w + v.
     noise_matrix = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
-    # Nothing was sent before the start.
+    # Nothing was sent before the start: all outputs are zero there. x_0 is a center and a draw of a law, whose mean is
+    # not counted twice.
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
-    line = [
+    output_names = [
         rename(name, f"{name}_{d}_ago" if d else f"{name}_sent") for d in range(past + 1) for name in sensor.outputs
     ]
     return LinearPlant(
@@ -71,8 +72,8 @@ def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
         noise=Shaped(noise_matrix, Independent([plant.noise, sensor.noise])),
         initial_mean=xp.concatenate([plant.initial_mean - law.mean, np.zeros(length + m)]),
         initial_covariance=Independent([law, Gaussian(np.zeros((length + m, length + m)))]),
-        input_matrix=driven,
-        states=(*plant.states, *line),
+        input_matrix=input_matrix,
+        states=(*plant.states, *output_names),
         inputs=plant.inputs,
         limits=plant.limits,
     )

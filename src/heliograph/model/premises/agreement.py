@@ -177,7 +177,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
         return False
     if isinstance(a, JointSensor) and isinstance(b, JointSensor) and len(a.parts) == len(b.parts):
         return all(_same_sensor(x, y, order) for x, y in zip(a.parts, b.parts, strict=True))
-    matrices = matrix_of(a), matrix_of(b)
+    matrices = find_sensor_matrix(a), find_sensor_matrix(b)
     if matrices[0] is not None and matrices[1] is not None:
         return equal_to_rounding(*matrices)
     # Sensors do not know how many states they measure: any number that both take will do.
@@ -222,11 +222,11 @@ def _takes_states(sensor: AbstractSensor, states: int) -> bool:
     return True
 
 
-def matrix_of(sensor: AbstractSensor) -> np.ndarray | None:
+def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
     """Return the matrix of a linear sensor, or of linear ones one above the other; None of any other."""
     if isinstance(sensor, LinearSensor):
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
-    parts = [matrix_of(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
+    parts = [find_sensor_matrix(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
     return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
 
 
@@ -246,7 +246,10 @@ def _same_gains(believed: Premise, own: Premise) -> bool:
 
 
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
-    """Decide whether two channels agree, their memories told apart by where they stand; `loses`: whatever is lost."""
+    """Decide whether two channels agree; memories count as the same where they stand at the same place.
+
+    `loses`: whether they may differ in what is lost, which a filter sees.
+    """
     if a is b:
         return True
     if isinstance(a, AbstractRandomAffine) and isinstance(b, AbstractRandomAffine):
@@ -295,8 +298,9 @@ def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
     if has_bounded_noise(a) != has_bounded_noise(b):
         return False
     believed, own = (_take_moments_by_arrival(channel) for channel in (a, b))
-    whole = [moments for there, moments in believed if there.all()]
-    return bool(whole and own) and all(_moments_agree(whole[0], moments, there) for there, moments in [*believed, *own])
+    of_all = [moments for arrived, moments in believed if arrived.all()]
+    # Each set of components that may arrive has, in both, the moments that it has where all arrive.
+    return bool(of_all and own) and all(_moments_agree(of_all[0], m, arrived) for arrived, m in [*believed, *own])
 
 
 Moments = tuple[np.ndarray, np.ndarray]  # E[(G, n)] (m, p + 1) and the tensor of E[z z' | y] (m, m, p + 1, p + 1)
@@ -323,14 +327,15 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
     return [(np.asarray(outcome.arrived), second_moments(outcome.map)) for outcome in parts]
 
 
-def _moments_agree(a: Moments, b: Moments, there: np.ndarray) -> bool:
-    """Decide whether moments of the components that are there are equal to rounding, each in units of its own size."""
-    rows = np.ix_(there, there)
-    power = [np.abs(np.einsum("iiaa->ia", second))[there] for _, second in (a, b)]
-    size = np.sqrt(np.maximum(*power))
+def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
+    """Decide whether moments of the components that arrived are equal to rounding, each in units of its own size."""
+    (mean_a, second_a), (mean_b, second_b) = a, b
+    rows = np.ix_(arrived, arrived)
+    powers = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]
+    size = np.sqrt(np.maximum(*powers))
     scale = size[:, None, :, None] * size[None, :, None, :]
-    means = np.abs(a[0] - b[0])[there] <= EQUAL * size
-    return bool(np.all(means) and np.all(np.abs(a[1][rows] - b[1][rows]) <= EQUAL * scale))
+    means_agree = np.all(np.abs(mean_a - mean_b)[arrived] <= EQUAL * size)
+    return bool(means_agree and np.all(np.abs(second_a[rows] - second_b[rows]) <= EQUAL * scale))
 
 
 def _same_observation(
@@ -347,7 +352,7 @@ def _same_observation(
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
     """Return the map from the state to what is received, of a linear sensor without angles."""
-    matrix = matrix_of(sensor)
+    matrix = find_sensor_matrix(sensor)
     if matrix is None or sensor.angles or channel.past:
         return None
     return Series([GainAndNoise(Constant(1.0), matrix, sensor.noise), channel])

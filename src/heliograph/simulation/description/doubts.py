@@ -13,7 +13,7 @@ from heliograph.filters.words.linear import SEEN
 from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
-from heliograph.model.premises.agreement import CHANNEL, matrix_of
+from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
 from heliograph.model.reported_numbers import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
@@ -164,7 +164,7 @@ def _find_unheard(network: Network) -> Iterator[Doubt]:
             continue
         # E z = sum_i E[G_i] y_i, y_i the outputs that link i carries: by states where the sensor is a matrix.
         links = [np.asarray(redraw_modes_each_step(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
-        matrix = matrix_of(first(node.sensor)) if not channel.past else None
+        matrix = find_sensor_matrix(first(node.sensor)) if not channel.past else None
         sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
         heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
         if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
