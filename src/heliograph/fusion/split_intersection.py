@@ -50,10 +50,9 @@ class SplitIntersection(AbstractIntersection):
             raise fail("known part", "shape (nodes, n, nodes, n) or (nodes, n, n)", f"shape {values.shape}")
         # P^a is symmetric and positive semidefinite, to rounding.
         flat = values.reshape(values.shape[0] * values.shape[1], -1)
-        scale = np.abs(flat).max(initial=0.0)
-        if not np.allclose(flat, flat.T, rtol=0, atol=DEFINITENESS_TOLERANCE * scale) or (
-            np.linalg.eigvalsh(flat)[0] < -DEFINITENESS_TOLERANCE * scale
-        ):
+        tolerance = DEFINITENESS_TOLERANCE * np.abs(flat).max(initial=0.0)
+        is_symmetric = np.allclose(flat, flat.T, rtol=0, atol=tolerance)
+        if not is_symmetric or np.linalg.eigvalsh(flat)[0] < -tolerance:
             raise fail("known part", "a covariance of all parts together", "a matrix that is none")
         self.known = values
 

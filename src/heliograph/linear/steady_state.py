@@ -172,8 +172,7 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     """
     what = "steady state"
     (a, q), (c, r) = plant_matrices(plant, what), sensor_matrices(sensor, len(first(plant).states), what)
-    zero = np.zeros(len(a)), np.zeros(len(c))
-    step = Steps(a, zero[0], q, c, zero[1], r)
+    step = Steps(transition=a, drift=np.zeros(len(a)), process=q, output=c, offset=np.zeros(len(c)), noise=r)
     try:
         prior = solve_discrete_are(a.T, c.T, q, r)
     except (LinAlgError, ValueError) as error:

@@ -157,7 +157,10 @@ class SeparatedTold(NamedTuple):
 
 
 def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
-    """Take a channel apart into its link and what is told of it; of another one all rows are values."""
+    """Take a channel apart into its link, the rows of its outputs, and the rows of the numbers told about it.
+
+    A channel that tells nothing is its own link, and all its rows are outputs.
+    """
     maps = channel.maps if isinstance(channel, Stack) else (channel,)
     told_of = {affine.memory.identity for affine in told_maps(channel)}
     rows, links, at_row = dict[str, tuple[int, ...]](), list[AbstractRandomAffine](), 0
@@ -221,6 +224,7 @@ def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more:
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
     told_names = [name for affine in told_maps(link) for name in affine.names] if numbers else []
     several = {name for name in told_names if told_names.count(name) > 1}
+    # From the first row to the last, so that each name is inserted at the place that it has in the end.
     for i, (row, name) in sorted(enumerate(zip(numbers, told_names, strict=True)), key=lambda item: item[1][0]):
         names.insert(row, f"{name}_{told_names[:i].count(name) + 1}" if name in several else name)
     return tuple(names)

@@ -76,8 +76,10 @@ def read_noise_of_inputs(
     noise: Any, outputs: Names | None, rows: int | None, inputs: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Any]:
     """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs."""
-    known = None if callable(noise) else count_components(noise)
-    count = rows or (known or 1 if outputs is None else len(name_list("sensor outputs", outputs)))
+    # How many outputs there are, said by the sensor's matrix, or by their names, or by the noise; else it is one.
+    components = None if callable(noise) else count_components(noise)
+    count_without_matrix = (components or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+    count = rows or count_without_matrix
     named = names("sensor outputs", outputs, count, "y")
     if not callable(noise):
         return named, as_noise("sensor noise", noise, count)

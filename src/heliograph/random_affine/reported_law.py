@@ -144,7 +144,7 @@ class AbstractTold(AbstractModal):
     def believed(self, numbers: Numbers) -> AbstractRandomAffine:
         """Return the map without memory, as the receiver knows it given the numbers."""
 
-    def give_law(self, numbers: Numbers) -> jax.Array:
+    def numbers_give_law(self, numbers: Numbers) -> jax.Array:
         """Decide whether numbers give a law; by default all that are finite do."""
         return jnp.all(jnp.isfinite(numbers))
 
@@ -215,14 +215,14 @@ class ToldMap(AbstractTold):
         """Return the map of these numbers."""
         return self.make(numbers)
 
-    def give_law(self, numbers: Numbers) -> jax.Array:
+    def numbers_give_law(self, numbers: Numbers) -> jax.Array:
         """Decide whether the map has finite numbers, and noises whose covariances are some.
 
         A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody
         knows. A gain that is told decides no noise.
         """
         if isinstance(self.make, ToldGainHop):
-            return super().give_law(numbers)
+            return super().numbers_give_law(numbers)
         link, usual = self.believed(numbers), self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
         noises = [
@@ -283,7 +283,7 @@ class PilotedHop(AbstractHop, AbstractTold):
         """Return the hop of the gain that was drawn."""
         return GainAndNoise(Constant(jnp.asarray(state)[0]), self.matrix, self.noise)
 
-    def give_law(self, numbers: Numbers) -> jax.Array:
+    def numbers_give_law(self, numbers: Numbers) -> jax.Array:
         """Return True: without a reading the gain has its own law."""
         return jnp.asarray(True)
 
@@ -334,7 +334,7 @@ def believe_told(channel: T, numbers: Numbers) -> T:
     return conditioned
 
 
-def give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
+def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
     """Decide whether what is told of each of the channel's maps gives a law.
 
     Args:
@@ -342,7 +342,7 @@ def give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
         numbers: what is told of all its maps, one after another.
     """
     parts = _share_numbers_by_map(channel, numbers)
-    return jnp.all(jnp.stack([affine.give_law(parts[affine.memory.identity]) for affine in told_maps(channel)]))
+    return jnp.all(jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in told_maps(channel)]))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:

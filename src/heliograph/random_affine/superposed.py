@@ -207,17 +207,23 @@ class _SumPowers(NamedTuple):
 
 
 def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _SumPowers:
-    """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner."""
-    ordered = tuple(sorted(places))
-    ones = library(matrix).ones((len(matrix), 1, 1))
-    where = [ordered.index(i) for i in places] + [len(places)]  # of each variable of the map, and of 1
-    by_degree = [ones]
+    """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner.
+
+    Args:
+        matrix: of the map, (corners, rows, columns).
+        outputs: number of its outputs.
+        places: of its inputs among all of y, in any order; those of the polynomials are sorted.
+        order: of the moments.
+    """
+    ordered, variables = tuple(sorted(places)), len(places) + 1
+    # The place of each variable of the map, and of the constant 1 behind them, in the sorted order.
+    sorted_place = np.array([ordered.index(i) for i in places] + [len(places)])
+    by_degree = [library(matrix).ones((len(matrix), 1, 1))]
     for degree in range(1, order + 1):
-        rows, columns = _find_degree(outputs, degree, order), times_one(len(places) + 1, degree, order)
-        target = np.argsort(
-            place_monomials(np.array(where)[factor_variables(len(places) + 1, degree)], len(places) + 1)
-        )
-        by_degree.append(matrix[:, rows[:, None], columns[target]])
+        rows, columns = _find_degree(outputs, degree, order), times_one(variables, degree, order)
+        # The place of each monomial among those of the sorted variables; then, by argsort, which one has each place.
+        place = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
+        by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place)]])
     return _SumPowers(ordered, by_degree)
 
 

@@ -218,8 +218,8 @@ def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -
     return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
 
 
-def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
-    """Return the matrices C_k with <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance."""
+def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
+    """Return the matrices C_k of the cost, <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance."""
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))
     matrices[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)

@@ -165,7 +165,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Take one step with a given gain: return the covariance after a slot, twice."""
+        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
         side, gain = row
         corrected = correct_moments(predict(covariance, side), gain)
         return corrected, corrected

@@ -18,7 +18,7 @@ from heliograph.relays.design import (
     given_design,
     join_gains,
     local_error_design,
-    receiver_weight,
+    make_receiver_cost,
     split_gains,
     start_moments,
 )
@@ -277,7 +277,7 @@ def receiver_error_design(
     if np.any(weights < 0) or sweeps < 1:
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")
     steps, start = network.steps(horizon), start_moments(network)
-    cost = receiver_weight(weights, len(network.filters), len(network.states))
+    cost = make_receiver_cost(weights, len(network.filters), len(network.states))
     # From the gains with which each filter minimises its own error.
     local_gains = join_gains(network, design.gains)
     if power_limit is None:

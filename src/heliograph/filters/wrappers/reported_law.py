@@ -36,7 +36,13 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.reported_law import believe_told, give_law, make_certain, numbers_of_outputs, told_maps
+from heliograph.random_affine.reported_law import (
+    believe_told,
+    make_certain,
+    numbers_give_law,
+    numbers_of_outputs,
+    told_maps,
+)
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
@@ -164,7 +170,7 @@ class ToldFilter(AbstractWrapper):
         link = at(self.link, k)
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
-        return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), give_law(link, complete)
+        return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), numbers_give_law(link, complete)
 
 
 def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
