@@ -16,7 +16,7 @@ import numpy as np
 from upper_claims import HORIZON, ROUNDING, SEED, STEPS, N, Numbers, Ratio, Reader, ascended, largest, plant_of
 
 import heliograph as hg
-from heliograph.fusion.quantizer import widen
+from heliograph.fusion.quantizer import widen_by_quantization
 
 COUNT, ROWS = 3, 6  # estimates that are fused; rows that are smoothed
 NODES = ("a", "b", "c")
@@ -79,7 +79,7 @@ def quantized(numbers: Numbers) -> Ratio:
     most = np.exp(read.real(N))
     sent = values + most * np.tanh(3 * read.real(4, N))
     with jax.enable_x64(True):
-        claimed = np.asarray(widen((chance * values.T) @ values, most))
+        claimed = np.asarray(widen_by_quantization((chance * values.T) @ values, most))
     return both((chance * sent.T) @ sent, claimed)
 
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.fusion.quantizer import widen
+from heliograph.fusion.quantizer import widen_by_quantization
 from heliograph.testing import check_quantizer
 
 ESCAPE = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
@@ -199,7 +199,7 @@ def test_the_widened_bound_dominates_every_correlation(seed, n):
     root, d = rng.normal(size=(n, n)), rng.exponential(size=n)
     p = root @ root.T
     with jax.enable_x64(True):
-        bound = np.asarray(widen(p, d))
+        bound = np.asarray(widen_by_quantization(p, d))
     assert np.all(dominates(bound, p, d, rng.normal(size=(200, n))))
     assert np.trace(bound) == pytest.approx((np.sqrt(np.trace(p)) + d.sum()) ** 2, rel=1e-12)  # the best t
     if n == 1:
@@ -209,9 +209,9 @@ def test_the_widened_bound_dominates_every_correlation(seed, n):
 def test_widening_at_its_limits():
     p, d = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([0.1, 0.2])
     with jax.enable_x64(True):
-        np.testing.assert_array_equal(widen(p, 0 * d), p)
-        np.testing.assert_allclose(widen(0 * p, d), 0.3 * np.diag(d), rtol=1e-15)
-        assert np.all(np.isnan(np.diag(widen(p, np.array([0.1, np.nan])))))
+        np.testing.assert_array_equal(widen_by_quantization(p, 0 * d), p)
+        np.testing.assert_allclose(widen_by_quantization(0 * p, d), 0.3 * np.diag(d), rtol=1e-15)
+        assert np.all(np.isnan(np.diag(widen_by_quantization(p, np.array([0.1, np.nan])))))
 
 
 def test_an_amplitude_that_follows_the_data_can_understate():
@@ -222,7 +222,7 @@ def test_an_amplitude_that_follows_the_data_can_understate():
     """
     q, k = 0.01, 1.0
     with jax.enable_x64(True):
-        bounds = [float(widen(np.array([[q * k**2]]), np.array([d]))[0, 0]) for d in (k, 0.0)]
+        bounds = [float(widen_by_quantization(np.array([[q * k**2]]), np.array([d]))[0, 0]) for d in (k, 0.0)]
     assert q * bounds[0] + (1 - q) * bounds[1] < 0.6 * 4 * q * k**2
     assert hg.fusion.UniformQuantizer(8, 1.0).claim("exact") == "nominal"
     assert ESCAPE.claim("upper") == "nominal"

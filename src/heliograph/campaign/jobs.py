@@ -22,7 +22,7 @@ from heliograph.campaign.store import (
     write_chunk,
 )
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import alike
+from heliograph.model.over_time import have_same_structure
 from heliograph.numerics.check import fail
 from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import PyTree
@@ -133,7 +133,7 @@ _seen: list[Network] = []
 
 def _drop_old_programs(network: Network) -> None:
     """Drop all compiled programs once networks of `COMPILED` other structures have been seen before this one."""
-    if any(alike(network, other) for other in _seen):
+    if any(have_same_structure(network, other) for other in _seen):
         return
     if len(_seen) == COMPILED:
         jax.clear_caches()  # type: ignore[no-untyped-call]

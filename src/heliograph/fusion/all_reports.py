@@ -19,7 +19,7 @@ from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns,
 from heliograph.filters.gaussian.signal import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
-from heliograph.fusion.quantizer import widen
+from heliograph.fusion.quantizer import widen_by_quantization
 from heliograph.fusion.report_link import ReportModel
 from heliograph.fusion.rules import Fused, Means
 from heliograph.linear.jump_system import propagate_by_mode
@@ -220,7 +220,7 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
     # Second moments of what is sent, of (m_i, 1), with the quantizers' error.
     error = jnp.asarray(links.error)
     sent = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
-    sent = jax.vmap(widen)(sent, jnp.pad(error, ((0, 0), (0, 1))))
+    sent = jax.vmap(widen_by_quantization)(sent, jnp.pad(error, ((0, 0), (0, 1))))
     # Noise of the reports: the spread of the links on what is sent. A link without spread adds none, whatever is sent,
     # also where the moments of that are unknown: along the estimates of one run.
     has_spread = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))

@@ -138,12 +138,12 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
     """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
     # K, U = I - K C and L = K (M - C) of each node, with the letters of the first lines of this file.
     gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)
-    wrong_gain = gain @ _subtract(observation.gain, filters.output)
+    wrong_gain = gain @ _subtract_without_rounding(observation.gain, filters.output)
     # A - F, and U (b - f) - L b - K (o - c).
-    matrices = _subtract(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
-    drifts = _subtract(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
+    matrices = _subtract_without_rounding(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
+    drifts = _subtract_without_rounding(jnp.broadcast_to(motion.shift, filters.drift.shape), filters.drift)
     shift = _multiply_by_node(keep, drifts) - wrong_gain @ jnp.asarray(motion.shift)
-    shift = shift - _multiply_by_node(gain, _subtract(observation.offset, filters.offset))
+    shift = shift - _multiply_by_node(gain, _subtract_without_rounding(observation.offset, filters.offset))
     of_state = keep @ matrices - wrong_gain @ motion.matrix
     return ErrorStep(
         transition=ErrorMap(motion.matrix, of_state, keep @ filters.transition),
@@ -247,7 +247,7 @@ def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> 
     return SourceFactors(mean.reshape(factors.mean.shape), roots, independent)
 
 
-def _subtract(a: Array, b: Array) -> jax.Array:
+def _subtract_without_rounding(a: Array, b: Array) -> jax.Array:
     """Return a - b, zero where it is rounding, so that a filter with the right model has no error that depends on x."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)

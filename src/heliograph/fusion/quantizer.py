@@ -91,7 +91,7 @@ class AbstractQuantizer(Module):
 Quantizer = TypeAliasType("Quantizer", AbstractQuantizer | OverTime)  # an OverTime holds one quantizer per step
 
 
-def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
+def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
     """Return a bound on the covariance of x - q, from that of x - xhat (or a bound) P; |q - xhat| <= D by component.
 
     With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So

@@ -60,7 +60,7 @@ def stack(models: Sequence[T]) -> T:
     return steps_of_parts
 
 
-def structure(model: object) -> Hashable:
+def structure_key(model: object) -> Hashable:
     """Return a key that is equal for model objects which differ in nothing but the values of their arrays."""
     return _describe_structure(*jax.tree.flatten(model))
 
@@ -70,9 +70,9 @@ def _describe_structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
-def alike(a: object, b: object) -> bool:
+def have_same_structure(a: object, b: object) -> bool:
     """Return whether two model objects differ in nothing but the values of their arrays."""
-    return structure(a) == structure(b)
+    return structure_key(a) == structure_key(b)
 
 
 def _stack_leaves(*leaves: PyTree) -> object:

@@ -137,10 +137,10 @@ def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
 
 def deliver_told(link: AbstractRandomAffine) -> Stack:
     """Return a link with the numbers that are told of its maps after z."""
-    return Stack([link, *_announce(link, link.inputs)])
+    return Stack([link, *_list_told_outputs(link, link.inputs)])
 
 
-def _announce(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
+def _list_told_outputs(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
     """Return the outputs that tell what each told map of a link tells, beside `sent` numbers."""
     return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
 
@@ -207,7 +207,7 @@ def stack_with_told(
     links = [separate_told(channel).link for channel in channels]
     placed, maps = place(links), list[AbstractRandomAffine]()
     for link, channel, of_all in zip(links, channels, placed, strict=True):
-        maps += [of_all] if link is channel else [of_all, *_announce(of_all, of_all.inputs)]
+        maps += [of_all] if link is channel else [of_all, *_list_told_outputs(of_all, of_all.inputs)]
     return Stack(maps)
 
 

@@ -67,7 +67,7 @@ class LocalPlane(Module):
         """
         phi, turn, rise = self._subtract_origin(latitude, longitude, height)
         radius, _ = self._origin
-        across, along = _meridian_difference(np.radians(self.latitude), self.height, phi, rise)
+        across, along = _subtract_on_meridian(np.radians(self.latitude), self.height, phi, rise)
         # The meridian's plane turned by the difference in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2).
         out = across - 2 * (radius + across) * np.sin(turn / 2) ** 2
         return self._from_meridian((radius + across) * np.sin(turn), out, along)
@@ -92,7 +92,7 @@ class LocalPlane(Module):
         across = (east**2 + 2 * radius * out + out**2) / (distance + radius)
         turn = np.arctan2(east, radius + out)
         phi, rise = self._find_latitude_and_height(across, along)
-        longitude = _wrap(self.longitude + np.degrees(turn))
+        longitude = _wrap_degrees(self.longitude + np.degrees(turn))
         return np.stack([self.latitude + np.degrees(phi), longitude, self.height + rise], axis=-1)
 
     def to_earth(self, position: ArrayLike) -> Float[np.ndarray, "*points 3"]:
@@ -162,7 +162,7 @@ class LocalPlane(Module):
         if np.any(beyond):
             expected = "-90 to 90 degrees (radians, longitudes and whole numbers of 1e-7 degrees are none)"
             raise fail("latitude of points", expected, f"{phi[beyond].flat[0]:g}")
-        return np.radians(phi - self.latitude), np.radians(_wrap(turn - self.longitude)), rise - self.height
+        return np.radians(phi - self.latitude), np.radians(_wrap_degrees(turn - self.longitude)), rise - self.height
 
     def _from_meridian(self, east: np.ndarray, out: np.ndarray, along: np.ndarray) -> np.ndarray:
         """Return east, north, up of what is east, out of the earth's axis and along it, seen from the origin."""
@@ -184,10 +184,10 @@ class LocalPlane(Module):
         origin = np.radians(self.latitude)
         radius, above = self._origin
         phi = _find_latitude_by_bowring(radius + across, above + along) - origin
-        r, z = _meridian_difference(origin, self.height, phi, np.zeros_like(phi))
+        r, z = _subtract_on_meridian(origin, self.height, phi, np.zeros_like(phi))
         rise = np.cos(origin + phi) * (across - r) + np.sin(origin + phi) * (along - z)
         for _ in range(NEWTON_STEPS):
-            r, z = _meridian_difference(origin, self.height, phi, rise)
+            r, z = _subtract_on_meridian(origin, self.height, phi, rise)
             c, s = np.cos(origin + phi), np.sin(origin + phi)
             curvature = SEMI_MAJOR * (1 - SQUARED_ECCENTRICITY) / (1 - SQUARED_ECCENTRICITY * s**2) ** 1.5  # M
             phi = phi + (c * (along - z) - s * (across - r)) / (curvature + self.height + rise)
@@ -211,7 +211,7 @@ def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray,
     return np.asarray((normal + height) * np.cos(latitude)), np.asarray(above * np.sin(latitude))
 
 
-def _meridian_difference(
+def _subtract_on_meridian(
     origin: float, height: float, phi: np.ndarray, rise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return r - r_0 and z - z_0 of a point, its latitude and height given by their differences to the origin's.
@@ -250,6 +250,6 @@ def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def _wrap(degrees: np.ndarray) -> np.ndarray:
+def _wrap_degrees(degrees: np.ndarray) -> np.ndarray:
     """Return degrees between -180 and 180; those that are there stay as they are, to the bit."""
     return np.where(np.abs(degrees) <= 180, degrees, degrees - 360 * np.round(degrees / 360))

@@ -108,7 +108,7 @@ def trend(
     prefix = "" if named == "trend" else f"{named}_"
     plant = LinearPlant(
         matrix=[[1.0, 1.0], [0.0, 1.0]],
-        noise=_diagonal(variances),
+        noise=_make_diagonal(variances),
         initial_mean=array("initial mean", initial_mean, (2,)),
         initial_covariance=_read_start(initial_variance),
         states=[f"{prefix}level", f"{prefix}slope"],
@@ -141,7 +141,7 @@ def seasonal(
     q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
     matrix = np.eye(n, k=-1)
     matrix[0] = -1.0
-    noise = _diagonal([q] + [0.0] * (n - 1))
+    noise = _make_diagonal([q] + [0.0] * (n - 1))
     named = text("name of a component", name)
     states = [named, *(f"{named}_{i}_ago" for i in range(1, n))]
     return Component(named, LinearPlant(matrix, noise, np.zeros(n), start, states=states), np.eye(n)[0])
@@ -182,7 +182,7 @@ def trigonometric_seasonal(
     named, blocks, states, loading = text("name of a component", name), [], [], []
     for j in range(1, count + 1):
         alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0: one state
-        blocks.append(np.array([[-1.0]]) if alone else _rotation(2 * np.pi * j / length))
+        blocks.append(np.array([[-1.0]]) if alone else _make_rotation(2 * np.pi * j / length))
         states += [f"{named}_{j}"] if alone else [f"{named}_{j}", f"{named}_{j}_shifted"]
         loading += [1.0] if alone else [1.0, 0.0]
     plant = LinearPlant(block_diagonal(blocks), q, np.zeros(len(states)), start, states=states)
@@ -213,7 +213,7 @@ def cycle(
     length, q = scalar("period", period, 2.0), scalar("variance of the cycle", variance, 0.0)
     factor = scalar("damping", damping, 0.0, STATIONARY)
     named = text("name of a component", name)
-    matrix = factor * _rotation(2 * np.pi / length)
+    matrix = factor * _make_rotation(2 * np.pi / length)
     start = q / (1 - factor**2)
     return Component(named, LinearPlant(matrix, q, np.zeros(2), start, states=[named, f"{named}_shifted"]), [1.0, 0.0])
 
@@ -324,14 +324,14 @@ def _read_start(variance: "ArrayLike | DiffuseStart") -> Any:
     return variance if isinstance(variance, DiffuseStart) else scalar("initial variance", variance, 0.0)
 
 
-def _rotation(angle: Any) -> Any:
+def _make_rotation(angle: Any) -> Any:
     """Return the matrix (2, 2) that turns a wave's pair of states by an angle in a step."""
     xp = library(angle)
     c, s = xp.cos(angle), xp.sin(angle)
     return xp.stack([xp.stack([c, s]), xp.stack([-s, c])])
 
 
-def _diagonal(variances: list[Any]) -> Any:
+def _make_diagonal(variances: list[Any]) -> Any:
     """Return the diagonal matrix of variances, some of which may be traced."""
     xp = library(variances)
     return xp.diag(xp.stack([xp.asarray(value) for value in variances]))

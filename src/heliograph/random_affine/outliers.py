@@ -43,7 +43,7 @@ class StudentT(AbstractNoise):
     mean: Vector
 
     def __init__(self, scale: ArrayLike, degrees: ArrayLike):
-        self.scale = check.covariance("scale of Student's law", scale, _size(scale))
+        self.scale = check.covariance("scale of Student's law", scale, _size_of_number(scale))
         self.degrees = scalar("degrees of Student's law", degrees, TINY)
         self.mean = np.zeros(self.scale.shape[-1])
 
@@ -131,7 +131,7 @@ class Contaminated(AbstractNoise):
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
         # Shares, covariances and biases of the kinds of outliers, one each.
-        inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
         outlier_shares, are_several = _read_shares(share)
         kinds = len(outlier_shares)
@@ -163,7 +163,7 @@ class Contaminated(AbstractNoise):
             ValueError: as for the class; no slice.
         """
         count = check_count("slices of an exponential bias", slices)
-        inlier = check.covariance("covariance of contaminated noise", covariance, _size(covariance))
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
         factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
         center, variance = _slice_exponential(count)
@@ -247,7 +247,7 @@ def has_bounded_noise(*parts: PyTree) -> bool:
     return any(leaf.bounded for leaf in jax.tree.leaves(parts, is_leaf=is_law) if is_law(leaf))
 
 
-def _size(value: ArrayLike) -> int | None:
+def _size_of_number(value: ArrayLike) -> int | None:
     """Return the size of the matrix that a number is, 1; None of a matrix, which has its own."""
     return None if rank("covariance", value) else 1
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.over_time import structure
+from heliograph.model.over_time import structure_key
 
 
 class FilterKind(NamedTuple):
@@ -40,7 +40,7 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
     """Return names in groups, by the structure of their items, in order of first appearance."""
     results: dict[object, list[str]] = {}
     for name, described in items:
-        results.setdefault(structure(described), []).append(name)
+        results.setdefault(structure_key(described), []).append(name)
     return tuple(tuple(names) for names in results.values())
 
 

@@ -23,7 +23,7 @@ from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
-from heliograph.model.over_time import alike, stack
+from heliograph.model.over_time import have_same_structure, stack
 from heliograph.model.premises.agreement import join_premises
 from heliograph.model.premises.premise import on_premise
 from heliograph.numerics.check import fail, instance, items
@@ -64,7 +64,7 @@ class SequentialFilter(AbstractSizedFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
         z = jnp.asarray(z)
-        if all(alike(filter, self.filters[0]) for filter in self.filters):
+        if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
         # Filters of different structure: one correction each.
         ends, innovations = np.cumsum([filter.received for filter in self.filters]), []

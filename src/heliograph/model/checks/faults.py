@@ -30,7 +30,7 @@ def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, "
         for x in _iterate_trials(before):
             states = [x]
             for plant in (at(part, step) for part in plants_in(filter)):
-                if _takes(plant, x, u):
+                if _plant_takes(plant, x, u):
                     states.append(np.asarray(plant.transition(jnp.asarray(x), jnp.asarray(u))))
                     if not np.isfinite(states[-1]).all():
                         return f"transition(x, u) returned {states[-1].tolist()} for x = {x.tolist()}{given}"
@@ -52,7 +52,7 @@ def _iterate_trials(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
             yield mean + sign * np.sqrt(variances[i]) * np.eye(len(mean))[i]
 
 
-def _takes(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
+def _plant_takes(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
     """Return whether a plant has as many states and inputs."""
     return len(plant.states) == len(x) and len(plant.inputs) == len(u)
 

@@ -46,7 +46,7 @@ def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
     if len(a.eqns) != len(b.eqns):
         return False
     names: tuple[dict[Any, int], dict[Any, int]] = {}, {}
-    _define(names, [*a.constvars, *a.invars], [*b.constvars, *b.invars])
+    _number_variables(names, [*a.constvars, *a.invars], [*b.constvars, *b.invars])
     for x, y in zip(a.eqns, b.eqns, strict=True):
         if x.primitive is not y.primitive or x.params.keys() != y.params.keys():
             return False
@@ -54,11 +54,11 @@ def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
             return False
         if not all(_same_parameter(x.params[key], y.params[key]) for key in x.params if key not in ASIDE):
             return False
-        _define(names, x.outvars, y.outvars)
+        _number_variables(names, x.outvars, y.outvars)
     return _same_atoms(names, a.outvars, b.outvars)
 
 
-def _define(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
+def _number_variables(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
     """Give the variables of both programs, a and b, their next numbers, in place."""
     for known, variables in zip(names, (a, b), strict=True):
         known.update({variable: len(known) + i for i, variable in enumerate(variables)})

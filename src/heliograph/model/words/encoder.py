@@ -171,7 +171,7 @@ class Words(Module):
             stream = (source << np.uint64(32)) + np.arange(outputs, dtype=np.uint64)
             state = stream * np.uint64(0x9E3779B97F4A7C15)
             state = state + (sequence.astype(np.uint64)[:, None] + np.uint64(1)) * np.uint64(0xBF58476D1CE4E5B9)
-            mixed = _mix(_mix(state))
+            mixed = _mix_bits(_mix_bits(state))
         uniform = (mixed >> np.uint64(11)).astype(float) / 2.0**53
         return self.each(self.step, outputs) * (uniform - 0.5)
 
@@ -188,7 +188,7 @@ def _checksum(node: str) -> int:
     return crc32(node.encode())
 
 
-def _mix(state: np.ndarray) -> np.ndarray:
+def _mix_bits(state: np.ndarray) -> np.ndarray:
     """Return 64 bits mixed by a round of splitmix64 (Steele, Lea and Flood 2014)."""
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

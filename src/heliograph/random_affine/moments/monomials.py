@@ -208,7 +208,9 @@ class JointMoments(Module):
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
         """Return E[Sym^order(H)] of a lower order, whose monomials are among these."""
-        matrix: jax.Array | np.ndarray = self.matrix[_among(self.outputs, self.inputs, self.order, order)]
+        matrix: jax.Array | np.ndarray = self.matrix[
+            _place_lower_monomials(self.outputs, self.inputs, self.order, order)
+        ]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
@@ -217,7 +219,7 @@ class JointMoments(Module):
 
 
 @cache_arrays
-def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
+def _place_lower_monomials(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
     """Return positions of monomials of degree `low` in (z, 1) and (y, 1), times powers of 1, among degree `high`."""
     return np.ix_(*(times_one(size + 1, low, high) for size in (outputs, inputs)))
 

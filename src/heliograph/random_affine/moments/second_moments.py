@@ -33,8 +33,8 @@ from heliograph.random_affine.moments.tensors import (
 )
 from heliograph.random_affine.moments.uncertain_law import (
     PROPORTIONAL_TOLERANCE,
+    bound_all_laws,
     bound_from_intervals,
-    dominate,
     tensors_of_law,
 )
 from heliograph.random_affine.superposed import Superposed
@@ -218,7 +218,7 @@ def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bo
         laws = [JointMoments(corner, nominal.outputs, nominal.inputs, 2) for corner in channel.corner_moments(2)]
         # One map above all laws for each of spread, shift and power.
         by_kind = zip(*(tensors_of_law(law, mean) for law in laws), strict=True)
-        parts = [dominate(stack_parts(tensors), mean) for tensors in by_kind]
+        parts = [bound_all_laws(stack_parts(tensors), mean) for tensors in by_kind]
     else:
         parts = bound_from_intervals(channel, nominal, mean)
     spread, shift, power = parts

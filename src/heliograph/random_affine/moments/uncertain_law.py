@@ -25,7 +25,7 @@ def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor,
     return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
 
 
-def dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
+def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
     """Return one map above all of the (law, m, m, p + 1, p + 1) tensors, such as the spreads under corner laws v.
 
     Where y enters as s_v M y y' M' under every law, and one noise matrix is above all others, the map of the largest

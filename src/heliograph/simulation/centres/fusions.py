@@ -12,10 +12,10 @@ from heliograph.filters.base import make_sizes
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
-from heliograph.fusion.quantizer import widen
+from heliograph.fusion.quantizer import widen_by_quantization
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, first, stack, structure
+from heliograph.model.over_time import at, first, stack, structure_key
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
@@ -93,7 +93,7 @@ class StackedFusions(Module):
             send_one_mean = map_all(lambda quantizer, state, mean: at(quantizer, k).step(state, mean), nodes)
             send = map_all(send_one_mean, fusions)
             states, sent = send(self.quantizers, states, means)
-            means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
+            means, covariances = sent.value, jax.vmap(jax.vmap(widen_by_quantization))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
         # Angles are taken near those of the first node, so that they can be averaged; then the rules in parallel.
@@ -237,7 +237,7 @@ def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
             # Of one structure: rules and quantizers, for the same number of nodes.
-            key = structure((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
+            key = structure_key((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
             names_by_structure.setdefault(key, []).append(name)
     places, claims = network.places, network.claims().get(FUSED, {})
     return tuple(

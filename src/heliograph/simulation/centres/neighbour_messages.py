@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion
 from heliograph.fusion.mesh.gains import correct_by_information
-from heliograph.fusion.quantizer import AbstractQuantizer, widen
+from heliograph.fusion.quantizer import AbstractQuantizer, widen_by_quantization
 from heliograph.numerics.types import Array, Bool, Float, Int
 
 
@@ -74,7 +74,7 @@ def quantize_estimate(
     """
     value = quantizer.step((), mean)[1]
     received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)
-    return received, widen(covariance, jnp.asarray(quantizer.error(len(mean))))
+    return received, widen_by_quantization(covariance, jnp.asarray(quantizer.error(len(mean))))
 
 
 def gather_messages(

@@ -205,7 +205,7 @@ def _transmit(
     if node.trigger.reference == "prediction" and reference is not None:
         sender = sender._replace(reference=reference)
     drawn = draw_key(key, k, node.checksums, TRIGGER)
-    sender, z = node.trigger.transmit(sender, y, z, drawn, k)
+    sender, z = node.trigger.receive_if_sent(sender, y, z, drawn, k)
     return LinkState(memory=memory, feed_back=link.feed_back, sender=sender, modes=modes), z
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import OverTime, at, first, over_time, structure
+from heliograph.model.over_time import OverTime, at, first, over_time, structure_key
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.types import PyTree
@@ -90,7 +90,7 @@ class SlottedRelays(AbstractMedium):
         # Slots of one structure share a branch.
         slots_alike: dict[object, list[int]] = {}
         for number, slot in enumerate(self.relays.slots):
-            slots_alike.setdefault(structure(slot), []).append(number)
+            slots_alike.setdefault(structure_key(slot), []).append(number)
         # Of each slot its branch, and its position within it.
         branch, position = np.zeros((2, len(self.relays.slots)), dtype=int)
         for i, numbers in enumerate(slots_alike.values()):
