@@ -47,12 +47,12 @@ class CarriedRounding(NamedTuple):
     worst: float
     when: int
 
-    def after_step(self, system: LinearSystem, k: int, s: Steps, gains: Gains) -> "CarriedRounding":
+    def after_step(self, system: LinearSystem, k: int, matrices: Steps, gains: Gains) -> "CarriedRounding":
         """Return F X F' + (I - G C) D (I - G C)' + G R G' of the rounding X before, with that of Cov(w) and Cov(v).
 
         An error D in Cov(w) adds as much to the error's covariance; a gain that minimises has no part in it.
         """
-        keep = np.eye(len(gains.gain)) - gains.gain @ s.output
+        keep = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
         rounding += (keep * system.rounding[k]) @ keep.T
         rounding += (gains.gain * system.received_rounding[k]) @ gains.gain.T
@@ -64,10 +64,10 @@ class CarriedRounding(NamedTuple):
         return CarriedRounding(rounding, worst, when)
 
 
-def take_noise_roots(s: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
+def take_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
     """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
-    reach = np.abs(s.output) @ np.sqrt(size)
-    return NoiseRoots(_root_with_rounding(s.process, size), _root_with_rounding(s.noise, reach**2))
+    reach = np.abs(matrices.output) @ np.sqrt(size)
+    return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, reach**2))
 
 
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
@@ -79,13 +79,13 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
-def step_covariance(root: Float[np.ndarray, "N _"], s: Steps, noises: NoiseRoots) -> RecursionStep:
+def step_covariance(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
     """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
 
     O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
     """
-    predicted = np.concatenate([s.transition @ root, noises.process], axis=1)
-    gain, after = observe_root(predicted, s.output, noises.received)
+    predicted = np.concatenate([matrices.transition @ root, noises.process], axis=1)
+    gain, after = observe_root(predicted, matrices.output, noises.received)
     return RecursionStep(gain, predicted, after)
 
 
@@ -117,23 +117,23 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
             if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
                 break
             before = now
-        s = system.step(k)
+        matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
-            noises = take_noise_roots(s, second_moments)
-        step = step_covariance(root, s, noises)
-        gains, root = _make_gains(system, s, step), step.root
-        rounding = rounding.after_step(system, k, s, gains)
+            noises = take_noise_roots(matrices, second_moments)
+        covariances = step_covariance(root, matrices, noises)
+        gains, root = _make_gains(system, matrices, covariances), covariances.root
+        rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
     over_time = Gains(*(repeat_last(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
     claim = _support_claim(claim, rounding.worst, rounding.when)
     return on_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
 
 
-def _make_gains(system: LinearSystem, s: Steps, step: RecursionStep) -> Gains:
+def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionStep) -> Gains:
     """Return the gains of one step: y+ = (I - G C) A y + ... + G z, of which W y+ is the estimate, and covariances."""
-    projection, gain = system.projection, step.gain
-    keep = np.eye(len(gain)) - gain @ s.output
-    transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
+    projection, gain = system.projection, covariances.gain
+    keep = np.eye(len(gain)) - gain @ matrices.output
+    transition, offset = keep @ matrices.transition, keep @ matrices.drift - gain @ matrices.offset
     return Gains(
         transition,
         gain,
@@ -141,11 +141,11 @@ def _make_gains(system: LinearSystem, s: Steps, step: RecursionStep) -> Gains:
         output=projection @ transition,
         direct=projection @ gain,
         output_offset=projection @ offset,
-        expected=s.output @ s.transition,
-        expected_offset=s.output @ s.drift + s.offset,
-        covariance=covariance_of_root(projection @ step.root),
-        predicted=covariance_of_root(projection @ step.predicted),
-        innovation=covariance_of_root(s.output @ step.predicted) + s.noise,
+        expected=matrices.output @ matrices.transition,
+        expected_offset=matrices.output @ matrices.drift + matrices.offset,
+        covariance=covariance_of_root(projection @ covariances.root),
+        predicted=covariance_of_root(projection @ covariances.predicted),
+        innovation=covariance_of_root(matrices.output @ covariances.predicted) + matrices.noise,
     )
 
 

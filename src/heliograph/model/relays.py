@@ -111,7 +111,7 @@ class RelayNetwork(Module):
         period = horizon if varies else min(len(self.slots), horizon)
         by_slot = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
         slot_of_step = np.arange(horizon) % period
-        slots = _SlotMoments(*(np.stack(parts)[slot_of_step] for parts in zip(*by_slot, strict=True)))
+        moments = _SlotMoments(*(np.stack(parts)[slot_of_step] for parts in zip(*by_slot, strict=True)))
         transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
         drift = _repeat_over_steps(self.plant, horizon, lambda p: p.noise.mean, 1)
         # E x+ = A E x + E w.
@@ -126,11 +126,11 @@ class RelayNetwork(Module):
             sensor_noise=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.covariance, 2),
             sensor_offset=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.mean, 1),
             state_mean=np.array(means),
-            gain=slots.gain,
-            offset=slots.offset,
-            spread=slots.spread,
-            receives_in_slot=slots.receives,
-            transmits_in_slot=slots.transmits,
+            gain=moments.gain,
+            offset=moments.offset,
+            spread=moments.spread,
+            receives_in_slot=moments.receives,
+            transmits_in_slot=moments.transmits,
             received=self.received,
         )
 

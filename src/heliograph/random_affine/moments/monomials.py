@@ -208,9 +208,8 @@ class JointMoments(Module):
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
         """Return E[Sym^order(H)] of a lower order, whose monomials are among these."""
-        matrix: jax.Array | np.ndarray = self.matrix[
-            _place_lower_monomials(self.outputs, self.inputs, self.order, order)
-        ]
+        places = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
+        matrix: jax.Array | np.ndarray = self.matrix[places]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
