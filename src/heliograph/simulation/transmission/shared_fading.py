@@ -100,15 +100,9 @@ def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     # Rows of each structure's channels, by the objects' identities: one object under many names is stacked once.
     unnamed = {identity: drop_names(channel) for identity, channel in {id(c): c for c in listed}.items()}
     rows_by_structure: dict[object, dict[int, int]] = {}
-<<<<<<< HEAD
     for identity, channel in unnamed.items():
-        row_of = rows_by_structure.setdefault(structure(channel), {})
-        row_of[identity] = len(row_of)
-=======
-    for key, channel in unnamed.items():
         row_of = rows_by_structure.setdefault(structure_key(channel), {})
-        row_of[key] = len(row_of)
->>>>>>> e4da34ea (Name keys, bounds and selections of models for what comes out of them)
+        row_of[identity] = len(row_of)
     # A group for each structure: its channels stacked, then one row for each name that has one of them.
     groups = []
     for row_of in rows_by_structure.values():
