@@ -62,9 +62,11 @@ class SentPower(Module):
     @property
     def words(self) -> str:
         """Sentence on whether the power stays bounded."""
-        if self.growth > 1:
-            return f"the plant is unstable: what is sent grows by {self.growth:.4g} a step, without limit"
-        return "what is sent stays bounded" if self.growth < 1 else "what is sent is known for these steps only"
+        if np.isnan(self.growth) or self.growth == 1:
+            return "what is sent is known for these steps only"
+        if self.growth < 1:
+            return "what is sent stays bounded"
+        return f"the plant is unstable: what is sent grows by {self.growth:.4g} a step, without limit"
 
 
 def power(
@@ -85,15 +87,16 @@ def power(
         seed: of the draws (default 0).
 
     Returns:
-        The powers, with standard errors where they are drawn.
+        The powers, with standard errors where they are drawn, and `growth`: the factor by which a linear plant's second
+        moment grows at each step in the long run, NaN for other plants and where a sensor has feedback.
 
     Raises:
         ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; inputs of
             another shape.
     """
     instance("network", network, Network, "a Network")
-    start = first(network.plant)
-    growth = spectral_radius(np.asarray(start.matrix)) ** 2 if isinstance(start, LinearPlant) else float("nan")
+    plant = first(network.plant)
+    growth = spectral_radius(np.asarray(plant.matrix)) ** 2 if isinstance(plant, LinearPlant) else float("nan")
     if network.relays is not None:
         sent = _compute_relay_powers(network, horizon)
         return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, growth)
@@ -102,7 +105,8 @@ def power(
     if horizon is None and covered is not None:
         raise fail("steady power", "a network that does not vary (give a horizon)", "parts that are OverTime")
     steps = 1 if horizon is None else check_horizon(horizon, covered)
-    u = np.zeros((steps, len(start.inputs))) if inputs is None else array("inputs", inputs, (steps, len(start.inputs)))
+    shape = steps, len(plant.inputs)
+    u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
     # E (y, 1)(y, 1)' of what each sensor sends: exact, or the mean of drawn trajectories.
     if _is_exact(network, sources):
         moments = _compute_moments(network.plant, sources, u, horizon)
@@ -114,14 +118,15 @@ def power(
     # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
     for name, informing in _find_feedback_filters(network).items():
         moments[name], growth = _compute_innovation_moments(informing, u, horizon), float("nan")
-    # What each hop of the channels sends, with the standard error over batches of drawn trajectories.
-    over_time, error = {}, {}
+    # What each hop of the channels sends, (batches, steps): of drawn trajectories in batches whose spread gives the
+    # standard error, of exact moments in one batch, without error.
+    over_time, standard_error = {}, {}
     for name, (_, channel) in sources.items():
-        for hop, values in _compute_hop_powers(channel, moments[name], horizon).items():
-            over_time[f"{name}.{hop}"] = values.mean(axis=0)
-            spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(steps)
-            error[f"{name}.{hop}"] = spread / np.sqrt(len(values))
-    return SentPower(over_time=over_time, standard_error=error, growth=growth)
+        for hop, of_batches in _compute_hop_powers(channel, moments[name], horizon).items():
+            over_time[f"{name}.{hop}"] = of_batches.mean(axis=0)
+            spread = of_batches.std(axis=0, ddof=1) if len(of_batches) > 1 else np.zeros(steps)
+            standard_error[f"{name}.{hop}"] = spread / np.sqrt(len(of_batches))
+    return SentPower(over_time=over_time, standard_error=standard_error, growth=growth)
 
 
 def _is_exact(network: Network, sources: Sources) -> bool:
@@ -198,8 +203,8 @@ def _compute_innovation_moments(
 def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
     """Return what a sensor and relays that filter send, at each step of the horizon or of their schedules.
 
-    Exact for schedules s+ = A s + K (z - B s - b) in which a relay expects the z that others would send if all of them
-    had its own estimate s, as `relay_schedules` makes them.
+    A schedule is a relay's filter s+ = A s + K (z - B s - b) with gains K given for each step. The power is exact where
+    a relay expects the z that others would send if all of them had its own estimate s, as `relay_schedules` makes them.
 
     Raises:
         ValueError: a schedule of another kind.
@@ -211,10 +216,11 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
     covered = min(len(schedule.gain) for schedule in schedules.values())
     steps = covered if horizon is None else check_horizon(horizon, covered)
     moved = relays.steps(steps)
-    # The schedule's A and B have to be the plant's A and the rows of B that the relay expects: rows of all filters,
-    # each filter's behind those before it.
+    # The schedule's A and B have to be the plant's A and the rows of B that the relay expects. `expected_rows` has the
+    # rows of all filters one after another, and those of a filter end at its entry of `ends`.
     expected_rows, n = moved.predict_maps()[0], len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
+    # What relays send does not depend on the receiver, whose gains may be zero; it is the last of `relays.received`.
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
     for (name, schedule), count in zip(schedules.items(), relays.received, strict=False):
         gains[name] = np.asarray(schedule.gain)[:steps]
@@ -222,11 +228,12 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
         pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
         if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
-    # The sensor sends y in the slots in which it transmits: E y'y there.
+    # The sensor (the first column of the slots) sends y where it transmits, of the power E y'y: the trace of E y y',
+    # which E (y, 1)(y, 1)' holds without its last row and column.
     seconds = moments_over(relays.plant, steps)
     measured = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(seconds)])
-    sensor = np.trace(measured[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
-    return {SENSOR: sensor, **given_design(relays, gains).power}
+    sensor_power = np.trace(measured[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
+    return {SENSOR: sensor_power, **given_design(relays, gains).power}
 
 
 def _draw_moments(
@@ -268,13 +275,13 @@ def _draw_squares(
     def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Return the state after step k, and (y, 1)(y, 1)' of every sensor that measures it then."""
         k, u = row
-        key_of_noise, *keys = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))
-        now = at(plant, k)
-        x = now.plus(now.transition(x, u), now.sample_noise(key_of_noise, u))
+        key_of_noise, *keys_of_sensors = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))
+        plant_k = at(plant, k)
+        x = plant_k.plus(plant_k.transition(x, u), plant_k.sample_noise(key_of_noise, u))
         squares = {}
-        for key_of_sensor, (name, sensor) in zip(keys, sensors.items(), strict=True):
-            here = at(sensor, k)
-            y = wrap_angles(here.measure(x) + here.noise.sample(key_of_sensor), here.angles)
+        for key_of_sensor, (name, sensor) in zip(keys_of_sensors, sensors.items(), strict=True):
+            sensor_k = at(sensor, k)
+            y = wrap_angles(sensor_k.measure(x) + sensor_k.noise.sample(key_of_sensor), sensor_k.angles)
             extended = jnp.append(y, 1.0)
             squares[name] = jnp.outer(extended, extended)
         return x, squares

@@ -46,44 +46,63 @@ class SummedLinks(NamedTuple):
 
 
 def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
-    """Return the best amplitudes (links,) of one scalar signal by formulas; None where there is none.
+    """Return the best amplitudes (links,) of one scalar signal by formulas; None where no formula is known.
 
-    The sum of links with amplitudes a carries the information j = (b' a)^2 / (a' D a + N), with the gains b, noise D of
-    the links and N of the receiver, and sends the power a' T a, T = diag(unit). There are formulas where only the total
-    power binds, and under limits of each amplitude where the noises of links are independent.
+    The sum of links with amplitudes a carries the information j = (b' a)^2 / (a' D a + N). Here b are the gains, D is
+    the noise of the links, and N (`floor`) that of the receiver. The links send the power a' T a, T = diag(unit).
+    There are formulas where only the total power binds, and under limits of each amplitude where the noises of links
+    are independent.
 
     Args:
         links: rows B (of one signal: multiples b of one direction), D, T and N.
         total: largest power that all may send together.
         caps: largest size of each amplitude.
     """
-    # One signal: all rows of B are multiples b_i of one direction.
-    _, sizes, right = np.linalg.svd(links.rows)
-    if len(sizes) > 1 and sizes[1] > ALIKE * sizes[0]:
+    # Formulas are known for one signal: then B has rank 1, and its rows are multiples b_i of one direction.
+    _, singular_values, right = np.linalg.svd(links.rows)
+    if len(singular_values) > 1 and singular_values[1] > ALIKE * singular_values[0]:
         return None
     b = links.rows @ right[0]
-    # Where only the total P binds: a ~ (D + N T / P)^-1 b.
+    # Where only the total P binds: a ~ (D + N T / P)^-1 b, scaled to send P.
     if np.isfinite(total):
         uncapped = np.linalg.solve(links.noise + np.diag(links.floor * links.unit / total), b)
         uncapped = uncapped * np.sqrt(total / (uncapped**2 @ links.unit))
         if np.all(np.abs(uncapped) <= caps):
             return np.asarray(uncapped)
-    diagonal = np.diagonal(links.noise)
-    if np.any(np.abs(links.noise - np.diag(diagonal)) > ALIKE * np.sqrt(np.outer(diagonal, diagonal))):
+    # Under limits of each amplitude there is a formula only if the links' noises are independent, D diagonal.
+    variances = np.diagonal(links.noise)
+    if np.any(np.abs(links.noise - np.diag(variances)) > ALIKE * np.sqrt(np.outer(variances, variances))):
         return None
     # Where only the limits of each bind.
-    capped: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), diagonal, links.floor, caps)
+    capped: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), variances, links.floor, caps)
     if capped**2 @ links.unit <= total:
         return capped
-    # Both: D + nu T and N - nu P in place of D and N, with the multiplier nu of the total, between 0 and N / P, at
-    # which the power is the total; by bisection, as the power falls with nu.
+    return _cap_and_share_total(links, b, variances, total, caps)
+
+
+def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total: float, caps: Vector) -> Vector:
+    """Return the best amplitudes (links,) where the total power P binds as well as the limits of some amplitudes.
+
+    They are those under the limits of each alone, with D + nu T and N - nu P in place of D and N. The multiplier nu
+    lies between 0 and N / P, where the links send P. It is found by bisection, as the power falls with nu.
+
+    Args:
+        links: D, T and N.
+        b: gains.
+        variances: the diagonal of D.
+        total: P.
+        caps: largest size of each amplitude.
+    """
+
+    def amplitudes_at(nu: float) -> Vector:
+        sizes = _cap_amplitudes(np.abs(b), variances + nu * links.unit, links.floor - nu * total, caps)
+        return np.asarray(np.sign(b) * sizes)
+
     low, high = 0.0, links.floor / total
     for _ in range(HALVINGS):
         nu = (low + high) / 2
-        sizes = _cap_amplitudes(np.abs(b), diagonal + nu * links.unit, links.floor - nu * total, caps)
-        low, high = (nu, high) if (np.sign(b) * sizes) ** 2 @ links.unit > total else (low, nu)
-    sizes = _cap_amplitudes(np.abs(b), diagonal + high * links.unit, links.floor - high * total, caps)
-    return np.asarray(np.sign(b) * sizes)
+        low, high = (nu, high) if amplitudes_at(nu) ** 2 @ links.unit > total else (low, nu)
+    return amplitudes_at(high)
 
 
 def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vector:
@@ -93,10 +112,11 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
 
     Args:
         b: gains, not negative.
-        noise: the diagonal of D.
-        floor: N.
+        noise: the diagonal of D, the variances of the links' noises.
+        floor: N, the variance of the receiver's noise.
         caps: largest amplitudes.
     """
+    # b_i / D_i; infinite for a link without noise, whose amplitude is then its cap.
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 
     def amplitudes_at(theta: float) -> Vector:
@@ -107,6 +127,7 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
         a = amplitudes_at(theta)
         return theta * float(b @ a) - float(noise @ a**2) - floor
 
+    # A bracket of theta, its upper end doubled; that has no end where no cap holds the amplitudes.
     low, high = 0.0, 1.0
     while excess(high) < 0:
         high *= 2

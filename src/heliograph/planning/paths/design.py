@@ -202,16 +202,17 @@ def make_power_task(
 
     def information(powers: Powers) -> PathInformation:
         """Return the information of all paths and its slope by the free powers, the others being fixed."""
-        every = fixed.copy()
-        every[:, free] = powers
-        of_paths = compute_path_information(paths, every)
+        of_all_hops = fixed.copy()
+        of_all_hops[:, free] = powers
+        of_paths = compute_path_information(paths, of_all_hops)
         return PathInformation(of_paths.information, of_paths.slope[:, free])
 
+    # Each start shares the total evenly over the hops of one mask.
     total = limits.total if np.isfinite(limits.total) else _choose_total(limits, paths)
     masks = choose_supports(paths.path[free], len(fixed), starts, seed)
-    even = [limits._replace(total=total).find_even_powers(mask) for mask in masks]
-    # The scale of the powers: the largest limit, or power of the first start, that is a number.
-    sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even[0].max(initial=0.0))]
+    even_powers = [limits._replace(total=total).find_even_powers(mask) for mask in masks]
+    # The scale of the powers: the largest limit, or power of the first start, that is finite; 1 if that is 0.
+    sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even_powers[0].max(initial=0.0))]
     scale = max((size for size in sizes if np.isfinite(size)), default=1.0) or 1.0
     problem = PathProblem(
         paths=paths,
@@ -221,7 +222,7 @@ def make_power_task(
         limits=limits,
         scale=scale,
     )
-    return PowerTask(problem=problem, free=free, fixed=fixed, starts=even)
+    return PowerTask(problem=problem, free=free, fixed=fixed, starts=even_powers)
 
 
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
@@ -261,17 +262,18 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
 def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
     problem, starts = task.problem, task.starts
-    # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there.
+    # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there. A criterion
+    # with a sharpness is an eigenvalue, not a trace.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole()))
         starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]
     powers = problem.solve_from_starts(starts)
     assert powers is not None  # the starts are within the limits
-    # How far the tangent at these powers still falls within the limits; of a convex error that is a bound.
+    # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
     value, bound = problem.exact(powers), problem.lower_bound(powers)
     _, tangent_value, _ = problem.support(powers)
     stationarity = max(tangent_value - bound, 0.0) / value
-    # Else the bound is that of the convex problem with concave envelopes above each path's information.
+    # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
         relaxed = task.relax()
         relaxed_powers = relaxed.solve_from_starts([task.of_paths(powers)])
@@ -289,7 +291,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
 def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
-    # Searched without the limit of the total, which is checked afterwards.
+    # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
     limits = task.problem.limits
     unlimited = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
     powers = _find_least_powers(unlimited.problem, task.starts, target)
@@ -299,10 +301,10 @@ def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     if total > limits.total * (1 + MET):
         least = find_least_error_powers(task)[1].value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
-    # What the tangent at these powers says that less would do; of a convex error that is a bound.
+    # The least total with which the error's tangent at these powers reaches the target. A convex error needs no less.
     bound = unlimited.problem.bound_least_total(powers, target)
     stationarity = 1 - bound / total if total > 0 else 0.0
-    # Else the bound is that of the convex problem with concave envelopes above each path's information.
+    # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
         relaxed, of_paths = unlimited.relax(), task.of_paths(powers)
         relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
@@ -374,14 +376,14 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
     """
     powers, certificate = find_least_error_powers(task) if target is None else least_power(task, target)
     paths = task.problem.paths
-    every = task.fixed.copy()
-    every[:, task.free] = powers
+    of_all_hops = task.fixed.copy()
+    of_all_hops[:, task.free] = powers
     # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
     all_free = task.problem._replace(path=paths.path, information=lambda p: compute_path_information(paths, p))
-    _, _, gradient = all_free.sensitivity(every)
+    _, _, gradient = all_free.sensitivity(of_all_hops)
     return PowerDesign(
         problem=problem,
-        powers=dict(zip(paths.names, every.T, strict=True)),
+        powers=dict(zip(paths.names, of_all_hops.T, strict=True)),
         error=task.problem.exact(powers),
         certificate=certificate,
         present=present,

@@ -131,11 +131,14 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     """
     if parts[-1].outputs != 1:
         raise _unfit(f"one gain for {parts[-1].outputs} numbers")
-    row, loss_factor, has_offset = rows[0], 1.0, False
-    hops: dict[str, tuple[float, float]] = {}
+    row = rows[0]
+    loss_factor = 1.0  # product of the losses' kappas
+    has_offset = False  # whether a wire behind a hop has added a constant
+    hops: dict[str, tuple[float, float]] = {}  # kappa and alpha by name
     while parts:
         affine = parts.pop(0)
-        # A loss that nobody observes is a random gain, 0 or 1, of kappa = 1 / P(arrival).
+        # A loss that nobody observes is a random gain, 0 or 1, of kappa = 1 / P(arrival). The maps that it may lose
+        # take its place in the series.
         if isinstance(affine, Mixture):
             inner, factor = _split_loss(affine)
             parts, loss_factor = [*inner.in_series, *parts], loss_factor * factor
@@ -153,7 +156,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
             raise _unfit("a wire of several numbers behind a hop")
         elif hops:  # a wire behind a hop: its gain changes no ratio, but a constant would be amplified by a relay
             has_offset = has_offset or bool(np.any(np.asarray(affine.noise.mean)))
-    # Losses multiply kappa of the last hop.
+    # Losses multiply kappa of the last hop: a path's information depends on the product of its kappas alone.
     if hops:
         last = list(hops)[-1]
         kappa, alpha = hops[last]
@@ -219,7 +222,7 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
 
     `state`: E (x, 1)(x, 1)' of the plant's state at this step.
     """
-    step = _PathsOfStep([], [], [], [], [], [], [], [])
+    step = _PathsOfStep(rows=[], second=[], signal=[], kappa=[], alpha=[], powers=[], names=[], path=[])
     for name, node in nodes.items():
         if node.informed_by is not None:
             raise _unfit("a sensor with feedback, whose power depends on the error")
@@ -232,12 +235,13 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
         chains = find_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
-        # Each chain is a path that carries row @ (y, 1): c, E of its square, that less the sensor's noise, its hops.
+        # Each chain is a path that carries chain.row @ (y, 1). Its number is that of its row in the list.
         for chain in chains:
-            row = chain.row[:-1]
-            step.rows.append(row @ np.asarray(sensor.matrix))
+            weights = chain.row[:-1]  # of y alone
+            step.rows.append(weights @ np.asarray(sensor.matrix))
             step.second.append(float(chain.row @ measured @ chain.row))
-            step.signal.append(step.second[-1] - float(row @ noise @ row))
+            step.signal.append(step.second[-1] - float(weights @ noise @ weights))
+            # Without a hop and without the sensor's noise the path would tell the signal exactly.
             if not chain.hops and not step.second[-1] > step.signal[-1]:
                 raise fail(f"sensor of {name!r}", "noise, since a wire adds none", "none")
             for hop, (kappa, alpha) in chain.hops.items():

@@ -19,7 +19,8 @@ from heliograph.planning.paths.relaxation import SplitPaths
 
 CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
 STEPS = 500
-PATIENCE, TRIES = 20, 12  # iterations that close the gap no further; points on the way
+PATIENCE = 20  # iterations in a row that do not close the gap further
+TRIES = 12  # points on the way to other powers
 STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
@@ -39,8 +40,9 @@ def water_filling(
 ) -> Powers:
     """Return the powers (time, free) of the least error within limits, where each path has one free hop.
 
-    By the fixed point that the optimum's condition gives: the powers that fill to one level at the present sensitivity
-    of the error, and on the way to them the best point, until the gap to a lower bound closes or shrinks no more.
+    Each iteration finds the powers that fill to one water level, with the present derivatives of the error, and moves
+    on the way to them to a point of less error. It ends when the gap to a lower bound of the error closes, or has not
+    shrunk for PATIENCE iterations.
 
     Args:
         limits: of the powers.
@@ -48,7 +50,7 @@ def water_filling(
         whole: the path of each free hop.
         start: powers at which to begin.
     """
-    # The information of each free hop's path is j = p / (a p + b).
+    # The information of each free hop's path is j = p / (a p + b) at the power p of that hop.
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
 
@@ -56,10 +58,10 @@ def water_filling(
         return ErrorSlopes(*sensitivity(powers))
 
     best = p = start
-    least_gap, idle = np.inf, 0
+    least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
     for _ in range(STEPS):
-        # The gap of Frank and Wolfe: what the error's tangent leaves to be gained.
+        # The gap of Frank and Wolfe: how far the error's tangent at p falls within the limits. No powers gain more.
         gap = float(np.sum(slopes.gradient * (p - limits.find_best_powers(-slopes.gradient))))
         idle = 0 if gap < (1 - CLOSED) * least_gap else idle + 1
         if gap < least_gap:
@@ -130,19 +132,21 @@ def _find_level(
     highest: Float[np.ndarray, "k"],
     total: float,
 ) -> float:
-    """Return the level y at which the powers min([min(y, highest) rise - dry]^+, peak) sum to the total; else infinity.
+    """Return the water level y at which k powers sum to the total; infinity where they do not reach it at any level.
 
-    Of k powers, each with its own `rise`, `dry`, `peak` and `highest` level.
+    A power is min([min(y, highest) rise - dry]^+, peak): it is 0 up to the level dry / rise, then grows by `rise` for
+    each unit of the level, until it has reached `peak` or the level `highest`.
     """
-    useful = rise > 0
-    rise, dry, peak, highest = rise[useful], dry[useful], peak[useful], highest[useful]
+    grows = rise > 0
+    rise, dry, peak, highest = rise[grows], dry[grows], peak[grows], highest[grows]
     if not rise.size or not np.isfinite(total):
         return np.inf
-    # The sum is piecewise linear in the level, with a turn where a power begins, or ends to grow.
+    # The sum is piecewise linear in the level: it bends where a power begins to grow, or stops.
     turns = np.concatenate([dry / rise, (dry + peak) / rise, highest])
     turns = np.unique(turns[np.isfinite(turns)])
-    sums = _fill_to_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)
+    sums = _fill_to_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)  # at each bend
     if total < sums[-1]:
         return float(np.interp(total, sums, turns))
-    growing = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)
-    return float(turns[-1] + (total - sums[-1]) / rise[growing].sum()) if growing.any() else np.inf
+    # Above the last bend only powers without an end grow, each by its `rise`.
+    is_endless = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)
+    return float(turns[-1] + (total - sums[-1]) / rise[is_endless].sum()) if is_endless.any() else np.inf
