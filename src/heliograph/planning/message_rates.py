@@ -23,7 +23,8 @@ from heliograph.simulation.simulate import monte_carlo
 
 NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
 POINTS = 200  # of half a grid: a step of its law is 64 million products
-PRODUCTS = 2e10  # of an iteration: seconds
+PRODUCTS = 2e10  # of all iterations for a law of cells: seconds
+PRODUCTS_OF_ITERATION = 20  # times the cube of the number of cells: of one iteration for their law
 RAREST = 1e-6  # rate of messages that a grid holds
 LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
 HELD = 5.5  # deviations of what is measured over which the grid reaches on either side
@@ -91,15 +92,16 @@ def simulate_rate(
     Raises:
         ValueError: parts that do not fit; counts below 2 runs and 4 steps.
     """
-    check_count("runs", runs, 2)
-    check_count("horizon", horizon, 4)
+    check_count("runs", runs, 2)  # of fewer no spread is known
+    check_count("horizon", horizon, 4)  # whose first quarter is left out
     node = Node(sensor, channel, {"event": event_filter(plant, sensor, channel, trigger)}, trigger=trigger)
     record = monte_carlo(Network(plant, {"sender": node}), horizon, runs, seed)
     # Means over time of each run, whose spread gives the standard errors: transmissions are (runs, steps, 1), errors
     # (runs, steps, n).
-    sent = record.transmissions["sender"][:, horizon // 4 :] != 0
+    settled = horizon // 4
+    sent = record.transmissions["sender"][:, settled:] != 0
     rates = sent.mean(axis=(1, 2))
-    squares = (record.errors("sender", "event")[:, horizon // 4 :] ** 2).mean(axis=1)
+    squares = (record.errors("sender", "event")[:, settled:] ** 2).mean(axis=1)
     return MessageRate(
         rate=float(rates.mean()),
         error=squares.mean(axis=0),
@@ -111,14 +113,18 @@ def simulate_rate(
 def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss: float = 0.0) -> MessageRate:
     """Return rate and error of a sender whose Kalman filter sends its estimate where the prediction is off by delta.
 
-    The prediction is that from the last estimate that was acknowledged; each is lost with probability `loss`, and the
-    sender knows. With P the variance of the sender's filter, P- that before it measures, and e the difference of its
-    estimate and the prediction, of a plant x+ = a x + N(0, q) measured with noise of variance R in units of x,
+    The prediction is that from the last estimate that was acknowledged. Each is lost with probability `loss`, and the
+    sender knows. Let P be the variance of the sender's filter, P- that before it measures, and e the difference of its
+    estimate and the prediction. Of a plant x+ = a x + N(0, q), measured with noise of variance R in units of x,
 
-        e+ = a e + N(0, s^2),  s^2 = P-^2 / (P- + R),     0 where an estimate arrives,
+        e+ = a e + N(0, s^2),  s^2 = P-^2 / (P- + R),     0 where an estimate arrives.
 
-    visits v(e) in silence from one arrival to the next: v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de), kappa = 1
-    within delta, `loss` beyond; rate (1 + int_{|e| > delta} v) / T and error P + int e^2 v / T, T = 1 + int v. Exact.
+    Let v(e) be the density of the values e over the steps without an arrival, from one arrival to the next. It solves
+
+        v = kappa (N(.; 0, s^2) + int N(.; a e, s^2) v de),  kappa = 1 within delta, `loss` beyond.
+
+    With the mean length T = 1 + int v of such a cycle the rate is (1 + int_{|e| > delta} v) / T and the error
+    P + int e^2 v / T. Both are exact.
 
     Args:
         plant: of one state.
@@ -130,15 +136,16 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
         ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
     Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
     """
-    a, q, c, r = system = _check_scalar(plant, sensor)
+    system = _check_scalar(plant, sensor)
+    a, q, c, r = system
     delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
     if not loss < 1:
         raise fail("loss", "a number below 1", loss)
     posterior = system.kalman_variance
     prior = a * a * posterior + q
     s = prior / np.sqrt(prior + r / c**2)
-    # Parts of the line, within delta and beyond, with nodes and weights. Beyond delta e stays only where what is sent
-    # is lost, so that without losses there is nothing.
+    # The line in parts, within delta and beyond, with nodes and weights of an integral over it. Beyond delta e stays
+    # only where what is sent is lost, so that without losses there is nothing.
     far = delta + REACH * s / np.sqrt(1 - loss)
     edges = [-far, -delta, delta, far] if loss else [-delta, delta]
     if far > LONGEST * s:
@@ -146,12 +153,13 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
             "delta and loss", f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}", f"{far:.3g}"
         )
     nodes, weights = _make_quadrature(edges, s)
-    # The integral equation of the visits v at the nodes (Nystrom's method), then the sums over a cycle.
-    kappa = np.where(np.abs(nodes) <= delta, 1.0, loss)
+    # The integral equation of v at the nodes (Nystrom's method), then the sums over a cycle.
+    is_within = np.abs(nodes) <= delta
+    kappa = np.where(is_within, 1.0, loss)
     kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights  # [to, from]
     visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights  # v de
     cycle = 1 + visits.sum()
-    rate = (1 + visits[np.abs(nodes) > delta].sum()) / cycle
+    rate = (1 + visits[~is_within].sum()) / cycle
     error = posterior + nodes**2 @ visits / cycle
     return MessageRate(rate=float(rate), error=np.array([error]), rate_error=0.0, error_error=np.zeros(1))
 
@@ -241,13 +249,13 @@ def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> tuple[in
 def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
     """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
 
-    x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta:
-    (x, last sent) is a Markov chain, here on cells of at most `share` of the lesser noise's deviation. Its law is held
-    as f[i, j] = P(x in cell i, last sent in cell j).
+    x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta. So
+    (x, last sent) is a Markov chain. Its law is held as f[i, j] = P(x in cell i, last sent in cell j), on cells no
+    longer than `share` of the lesser noise's deviation.
     """
     a, q, r = system.a, system.q, system.r
     cells_each_side, cells_of_delta, h = _choose_cells(system, delta, share)
-    # Probabilities of a cell given the middle of another, which sum to 1: move[new, old], noise[x, z].
+    # Probabilities of a cell given the middle of another: move[new, old] of x after a step, noise[x, z] of z given x.
     x = np.arange(-cells_each_side, cells_each_side + 1) * h
     move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
     # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
@@ -264,8 +272,9 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     deviation = np.sqrt(q / (1 - a * a))
     start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
     operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
+    most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
     try:
-        _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=int(PRODUCTS / size**3 / 20) + 2, tol=1e-9)
+        _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)

@@ -11,6 +11,8 @@ from heliograph.numerics.types import Array
 from heliograph.testing.filters import ROUNDING
 
 SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for to the root of rounding, 1e-8
+DRAWS = 10  # joint covariances on which a rule is tested
+STARTS, ASCENTS = 8, 50  # of the search for the worst direction: ascents, and steps of each
 
 
 def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0) -> None:
@@ -35,7 +37,7 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
     for claim in claims:
         fused = rule.claim([claim, *others])
         assert STRENGTH[fused] <= STRENGTH[claim], f"claim: expected at most {claim!r}, got {fused!r}"
-    for _ in range(10):
+    for _ in range(DRAWS):
         # A joint covariance of the errors, (input, state, input, state), whose blocks on the diagonal are the bounds.
         root = generator.normal(size=(count * n, count * n))
         joint = (root @ root.T).reshape(count, n, count, n)
@@ -43,21 +45,20 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
         alike = _fuse_bounds(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
         _check_close("identical estimates", alike.mean, np.ones(n))
         _check_close("identical bounds", alike.covariance, bounds[0])
-        # The fused mean is linear in the means, so unit means, one for each number of each input and all fused
-        # together in a vmap, give the gains side by side (n, count n).
-        units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
-        together = _fuse_bounds(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
-        _check_close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, units[:, 0], bounds).mean)
+        # The fused mean is linear in the inputs' means: sum_i W_i mean_i. So sets of means in which one number is 1 and
+        # all others are 0 give the columns of the gains W = (W_1, W_2, ...), (n, count n), when fused in a vmap.
+        unit_sets = np.eye(count * n).reshape(count * n, count, n)
+        unit_means = np.moveaxis(unit_sets, 1, 0)  # (input, set, state): inputs first, as `fuse` takes them
+        together = _fuse_bounds(rule, unit_means, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
+        _check_close("fusing inside vmap", together.mean[0], _fuse_bounds(rule, unit_means[:, 0], bounds).mean)
         gains = np.asarray(together.mean).T
+        # An upper bound holds where the fused error's covariance less it has no eigenvalue above zero.
         if rule.claim(["upper"] * count) == "upper":
-            claimed = np.asarray(together.covariance[0])
+            claimed = np.asarray(together.covariance[0])  # alike in all sets, as it does not depend on means
             excess = gains @ joint.reshape(count * n, count * n) @ gains.T - claimed
             worst = max(np.linalg.eigvalsh(excess)[-1], _find_worst_excess(gains, bounds, claimed, generator))
             limit = ROUNDING * np.trace(claimed)
             assert worst <= limit, f"bound: expected an upper one, exceeded by {worst:g}"
-
-
-STARTS, ASCENTS = 8, 50
 
 
 def _find_worst_excess(
@@ -132,22 +133,22 @@ def _check_quantizer_steps(quantizer: AbstractQuantizer, n: int, steps: int, gen
         # Values over seven decades, some components NaN.
         value = generator.normal(size=n) * 10.0 ** generator.integers(-3, 4, size=n)
         value[generator.random(n) < 0.1] = np.nan
-        following, sent = quantizer.step(state, value)
-        assert str(jax.tree.structure(following)) == structure, "step: expected a state of init's structure"
+        next_state, sent = quantizer.step(state, value)
+        assert str(jax.tree.structure(next_state)) == structure, "step: expected a state of init's structure"
         _check_quantized(sent, value, n)
-        # Q(Q(x)) = Q(x) where a component is not saturated, which then has a finite error.
+        # Q(Q(x)) = Q(x) where a component is not saturated: there its error is finite.
         again = np.asarray(quantizer.step(state, sent.value)[1].value)
-        is_usable = np.isfinite(sent.error)
-        is_off = np.abs(again - sent.value)[is_usable] > ROUNDING * np.abs(value)[is_usable]
+        is_unsaturated = np.isfinite(sent.error)
+        is_off = np.abs(again - sent.value)[is_unsaturated] > ROUNDING * np.abs(value)[is_unsaturated]
         assert not np.any(is_off), f"step {k}: expected what was delivered to be delivered again"
-        # The same compiled, for two equal values in a batch.
+        # The same compiled, for a batch of two equal states and values.
         batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
         _, twice = in_vmap(*batch)
         for name, delivered in sent._asdict().items():
             both = np.asarray(getattr(twice, name))
             is_same = np.allclose(both, delivered, rtol=ROUNDING, atol=0, equal_nan=True)
             assert is_same, f"step {k}, {name}: expected the same under jit and vmap"
-        state = following
+        state = next_state
 
 
 def _check_quantized(sent: Quantized, value: np.ndarray, n: int) -> None:

@@ -44,7 +44,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
     if target == 0:
         raise fail("target error", "a number above zero", "0")
-    # What cannot be is refused before any descent: at the start, and near the ends of the numbers' ranges.
+    # Numbers of which no network can be made are refused before any descent: at the start, and near their ends.
     present = problem.solve_at(problem.numbers.start)
     problem.check_ends()
     # The best of descents from the start, and from points that are drawn.
@@ -55,7 +55,8 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     best = search_from_starts(descent, limits, points)
     if best is None:
         raise _explain_unmet(descent, limits, points)
-    # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound.
+    # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound. With a
+    # target what was minimised is the power, else the error.
     found, conditions = problem.solve_at(best), check_lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
@@ -133,23 +134,23 @@ def check_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimi
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
     """
-    # In units of each number and of the value at x, `programme.size`: z = x / unit.
+    # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.objective(z)
-    # Normals of the limits that are reached: of powers, the target last, and of the numbers' ends.
+    # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
     reached = programme.limit_room(z) < ACTIVE
     axes = np.eye(len(z))
     at_low, at_high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
     normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
     multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
     if normals:
-        solution, residual = nnls(np.array(normals).T, gradient)
+        solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
         multipliers[reached] = solution[: int(reached.sum())]
     # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power.
     worth = limits.rows.T @ multipliers[: len(limits.most)] * programme.size
     if limits.target is not None:
-        # The value is the mean power, so that a watt of one step is 1 / steps of it, and `worth` what limits add. The
-        # target's multiplier, power per error, turns that into the error that the watt takes away.
+        # With a target the value is the mean power. A watt at one step costs 1 / steps of it, and what limits add
+        # (`worth`). Divided by the target's multiplier, power per error, that is the error that the watt takes away.
         power_per_error = multipliers[-1] * programme.size / limits.target
         worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
     return LagrangeConditions(

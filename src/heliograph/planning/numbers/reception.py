@@ -59,6 +59,14 @@ class NodeReception(NamedTuple):
     powers: Float[Array, "time hops"]
 
 
+class _StepsReception(NamedTuple):
+    """H, N and sent powers over steps with one sensor and channel; fields as of `NodeReception`."""
+
+    output: Float[Array, "time M m n"]
+    noise: Float[Array, "time M m m"]
+    powers: Float[Array, "time hops"]
+
+
 class _ObservedModes(NamedTuple):
     """A channel by its observed modes.
 
@@ -131,7 +139,8 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     plants = [at(network.plant, k) for k in range(steps)]
     a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
-    # What each node receives, from the second moments E (x, 1)(x, 1)' of the state itself.
+    # What each node receives, from the second moments E (x, 1)(x, 1)' of the state. They are steady where the steps
+    # repeat for ever.
     seconds = [steady_moment(plants[0])] * steps if forever else moments_over(network.plant, steps)
     states = jnp.stack([jnp.asarray(second) for second in seconds])
     b = None if young is None else jnp.broadcast_to(young, (steps,))
@@ -139,9 +148,10 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)
-    # All nodes together: modes of independent nodes have the Kronecker products of their laws and chains.
+    # All nodes together have a mode for each combination of theirs. As nodes are independent, its probabilities are
+    # products of theirs: Kronecker products of laws and of chains, in the order of `_stack_nodes`.
     output, noise = _stack_nodes(nodes)
-    # Young's bound is a step of the filter with (1 + b) A X A' and (1 + b) Q.
+    # Young's bound is a step of the filter with (1 + b) A X A' and (1 + b) Q; without uncertain gains b = 0.
     scale = jnp.ones((steps, 1, 1)) * (1.0 if b is None else 1 + b[:, None, None])
     return ModeSystem(
         transition=jnp.sqrt(scale) * a,
@@ -196,8 +206,8 @@ def describe_reception(
         now = np.array(span)
         b = None if young is None else young[now]
         parts.append(_describe_steps(at(source.sensor, span[0]), channel, of_channel, states[now], b, law[now]))
-    output, noise, powers = (jnp.concatenate(series) for series in zip(*parts, strict=True))
-    return NodeReception(chain=chain, law=law, output=output, noise=noise, powers=powers)
+    over_time = _StepsReception(*(jnp.concatenate(of_spans) for of_spans in zip(*parts, strict=True)))
+    return NodeReception(chain=chain, law=law, **over_time._asdict())
 
 
 def _find_laws_and_chain(
@@ -225,16 +235,28 @@ def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
 
 
 def _observe_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
-    """Return the modes of a channel that a filter is told, with what arrives in each, and whether they have memory."""
+    """Return the modes of a channel that its receiver observes, with what arrives in each, and whether they forget.
+
+    Without memory they are the outcomes of its losses; with memory the modes of its chains, which it delivers.
+    """
     if not memories(channel):
         cases = channel.list_outcomes()
         law = jnp.stack([jnp.asarray(case.probability) for case in cases])
-        maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
-        return _ObservedModes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
+        return _ObservedModes(
+            onward=jnp.tile(law, (len(cases), 1)),  # whatever the mode was
+            initial=law,
+            maps=[case.map for case in cases],
+            arrived=[case.arrived for case in cases],
+            forgets=True,
+        )
     joint = _make_flagged_modes(name, channel)
     everything = np.ones(joint.maps[0].outputs, dtype=bool)
     return _ObservedModes(
-        joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False
+        onward=joint.transition,
+        initial=joint.initial,
+        maps=list(joint.maps),
+        arrived=[everything] * len(joint.maps),
+        forgets=False,
     )
 
 
@@ -247,7 +269,8 @@ def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     parts = channel.in_parallel
     rest = [affine for affine in parts if not isinstance(affine, ModeOutput)]
     flags, chains = len(parts) - len(rest), memories(channel)
-    if any(memory.drifts for memory in chains.values()) or not rest or flags != len(chains):
+    delivers_all_modes = flags == len(chains) and not any(memory.drifts for memory in chains.values())
+    if not rest or not delivers_all_modes:
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
     return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
 
@@ -275,7 +298,7 @@ def _describe_steps(
     states: Array,
     young: Array | None,
     law: Array,
-) -> tuple[Array, Array, Array]:
+) -> _StepsReception:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 
     H is the mean map from state to what arrives in each of M modes, N the covariance of its noise.
@@ -292,16 +315,21 @@ def _describe_steps(
     y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
     described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
-    output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
+    outputs = [jnp.tile(h, (len(y), 1, 1)) for h, _ in described]  # H of a mode is the same at each step
 
     def compute_powers(moment: Array, law: Array) -> Array:
         """Return the powers (hops,) of a step with E (y, 1)(y, 1)' = moment, and this law of the modes (M,)."""
         powers = [jnp.asarray(power) for power in compute_powers_of_law(channel, moment, law).values()]
         return jnp.stack(powers) if powers else jnp.zeros(0)
 
-    # What a channel without memory loses it sends nevertheless: to its transmitters it has one mode.
-    powers = jax.vmap(compute_powers)(y, jnp.ones((len(y), 1)) if modes.forgets else law)
-    return output, jnp.stack([noise for _, noise in described], axis=1), powers
+    # The modes of a channel without memory are its losses. What is lost is sent nevertheless, so that they do not
+    # matter to the transmitters: a law of one mode, of probability 1.
+    law_of_sending = jnp.ones((len(y), 1)) if modes.forgets else law
+    return _StepsReception(
+        output=jnp.stack(outputs, axis=1),
+        noise=jnp.stack([noise for _, noise in described], axis=1),
+        powers=jax.vmap(compute_powers)(y, law_of_sending),
+    )
 
 
 def _describe_mode(
