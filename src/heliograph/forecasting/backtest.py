@@ -179,12 +179,10 @@ def backtest(
     if refit is not None:
         starts = range(first, rows, check_count("every", every))
         networks = {row: _refit(refit, row, network) for row in starts}
-    # By such a row the filters of its network; then of each filter the scores over all of these.
-    targets = [
-        list_targets(_find_origin(fitted, record, measurements, inputs, time, truth)) for fitted in networks.values()
-    ]
+    # The filters of each network, in one order; then the scores of each filter over the rows of all networks.
+    origins = [_find_origin(fitted, record, measurements, inputs, time, truth) for fitted in networks.values()]
     scores = list[Score]()
-    for of_filter in zip(*targets, strict=True):
+    for of_filter in zip(*(list_targets(origin) for origin in origins), strict=True):
         if (of_filter[0].node, of_filter[0].filter) in list_filtered_places(network):
             scores += _score_filter(list(zip(networks, of_filter, strict=True)), record, u, ahead, first)
     if not scores:
@@ -230,9 +228,8 @@ def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
 class _ComparedForecasts(NamedTuple):
     """Forecasts from each row, and what came: of the numbers that a filter receives, or of its states.
 
-    part: "received" or "state". names: of the numbers. moments: of their forecasts (rows, horizons, ...). came: what
-    came
-    (rows, numbers). angles: indices of the angles among them.
+    part: "received" or "state". names: of the numbers. moments: of their forecasts (rows, horizons, ...). came: the
+    numbers that came (rows, numbers). angles: indices of the angles among them.
     """
 
     part: str
@@ -254,9 +251,9 @@ def _score_filter(
         ahead: horizons, in rows.
         first: first row from which a forecast counts.
     """
-    _, target = segments[0]
+    _, target = segments[0]  # in names and claim all segments are alike
     filter, node = target.outlook.filter, target.node
-    if filter.claim == "none":
+    if filter.claim == "none":  # no covariance, so no forecast of a law
         return []
     # Forecasts from each row, and what came.
     z = select_measurements(target, record)
@@ -321,22 +318,20 @@ def _score_number(
     """
     # The forecasts that count, and what came `horizon` rows later.
     law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
-    # An angle within half a turn of what was expected.
+    # An angle is taken within half a turn of what was expected.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     # Nothing was forecast yet where the start is unknown (infinite variances).
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
     error, probability_below = came - law.mean, compute_probability_below(law, came)
-    absent = np.where(np.isnan(error), np.nan, 0.0)
-    coverage = tuple(
-        average_overlapping((np.abs(probability_below - 0.5) <= level / 2) + absent, horizon) for level in LEVELS
-    )
+    nan_if_absent = np.where(np.isnan(error), np.nan, 0.0)  # added to 0 or 1, so that absent rows do not count
+    in_middle = [(np.abs(probability_below - 0.5) <= level / 2) + nan_if_absent for level in LEVELS]
     return Score(
         *number,
         horizon=horizon,
         compared=int(np.sum(~np.isnan(error))),
         bias=average_overlapping(error, horizon),
         mse=average_overlapping(error**2, horizon),
-        coverage=coverage,
+        coverage=tuple(average_overlapping(is_inside, horizon) for is_inside in in_middle),
         log_score=average_overlapping(log_score(law, came), horizon),
         crps=average_overlapping(crps(law, came), horizon),
     )
@@ -363,7 +358,7 @@ def _forecast_from_each_row(
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 
-    (rows, places, K, ...), with variances in the place of covariances.
+    They are (rows, places, K, ...), of mixtures of K parts, with variances in the place of covariances.
 
     Args:
         outlook: how the filter is read ahead.

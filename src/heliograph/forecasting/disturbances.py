@@ -98,7 +98,13 @@ class Disturbances:
     def _describe(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
         """Return the shock of a row: the residual number `place` of its residuals, with its probability."""
         kind: Literal["break", "outlier"] = "outlier" if place < len(self.outputs) else "break"
-        return Shock(row, kind, (*self.outputs, *self.states)[place], float(residuals[place]), float(p[place]))
+        return Shock(
+            row=row,
+            kind=kind,
+            name=(*self.outputs, *self.states)[place],
+            residual=float(residuals[place]),
+            p=float(p[place]),
+        )
 
 
 def disturbances(
@@ -125,7 +131,8 @@ def disturbances(
     predicted = predict_rows(filter, rows, inputs)
     if not _is_received_unchanged(predicted):
         raise fail("disturbances", "a filter whose channel hands on what is measured", "one with gains or noise")
-    # Both noises given all data, from the innovations e of the filter's predictions.
+    # Both noises given all data, from the innovations e of the filter's predictions. The filter predicts what arrives,
+    # which here is what is measured.
     C, R = np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
     A, Q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)  # type: ignore[union-attr]  # a Gaussian's
     assert predicted.received is not None
@@ -151,6 +158,7 @@ def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
     """
     premise = filter.premise
     plant, sensor = (None, None) if premise is None else (premise.plant, premise.sensor)
+    # A model that does not vary has arrays for matrices.
     if (
         filter.claim == "exact"
         and isinstance(plant, LinearPlant)
@@ -181,11 +189,16 @@ def _smooth_noises(
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return the outputs' noise and the plant's given all data, each as means (steps, size) and covariances.
 
-    Backward over the rows with r and N = Cov r, which hold what all later rows tell: with S = C P C' + R and
-    K = P C' S^-1 the outputs' noise has the mean R (S^-1 e - K' r) and the covariance R (S^-1 + K' N K) R; then
-    r <- C' S^-1 e + (I - K C)' r, the plant's noise on the way to the row has the mean Q r and the covariance Q N Q,
-    and r <- A' r. Rows of C that did not arrive are left out, and so is what lies before the first row at which all of
-    an unknown start had been heard: NaN there.
+    Backward over the rows with r and N = Cov r, which hold what all later rows tell. At each row, with
+    S = C P C' + R and K = P C' S^-1:
+
+    - the outputs' noise has the mean R (S^-1 e - K' r) and the covariance R (S^-1 + K' N K) R;
+    - r <- C' S^-1 e + (I - K C)' r takes this row in;
+    - the plant's noise on the way to the row has the mean Q r and the covariance Q N Q;
+    - r <- A' r leads to the row before.
+
+    Rows of C that did not arrive are left out. Rows before the first at which all of an unknown start had been heard
+    stay NaN.
 
     Args:
         A: transition (n, n).
@@ -199,7 +212,7 @@ def _smooth_noises(
     n = len(A)
     output_mean, output_covariance = np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)
     plant_mean, plant_covariance = np.full((steps, n), np.nan), np.full((steps, n, n), np.nan)
-    is_known = np.isfinite(P).all(axis=(1, 2))
+    is_known = np.isfinite(P).all(axis=(1, 2))  # an unknown start has infinite variances
     first_known = int(np.argmax(is_known)) if is_known.any() else steps
     r, N = np.zeros(n), np.zeros((n, n))
     for k in reversed(range(first_known, steps)):

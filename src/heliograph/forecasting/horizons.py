@@ -191,11 +191,11 @@ def _complete_inputs(
     Args:
         origin: has the inputs of the last row; `several` where it is of several plants.
         names: of all inputs.
-        others: those but dt.
+        others: names of those but dt, the length of a step.
         inputs: an array (count, others), or one for each plant; "held" for those of the last row; None for none.
         count: number of rows.
     """
-    plants = (len(origin.inputs),) if origin.several else ()
+    plants = (len(origin.inputs),) if origin.several else ()  # leading axis of several plants
     if isinstance(inputs, str) and inputs != "held":
         raise fail("inputs ahead", 'an array, or "held"', repr(inputs))
     if not others:
@@ -208,9 +208,10 @@ def _complete_inputs(
     if not isinstance(inputs, str):
         axes = rank("inputs ahead", inputs)
         rows = np.reshape(inputs, (-1, 1)) if len(others) == 1 and axes == 1 else inputs
-        shape = (count, len(others))
-        given = array("inputs ahead", rows, (*plants, *shape) if axes == 3 and plants else shape)
-        return np.broadcast_to(given, (*plants, *shape)), "given"
+        of_one_plant = (count, len(others))
+        of_all_plants = (*plants, *of_one_plant)
+        given = array("inputs ahead", rows, of_all_plants if axes == 3 and plants else of_one_plant)
+        return np.broadcast_to(given, of_all_plants), "given"
     # Held: those of the last row, again and again.
     last = origin.inputs[..., [list(names).index(name) for name in others]]
     if np.isnan(last).any():

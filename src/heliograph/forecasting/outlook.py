@@ -95,12 +95,15 @@ class Outlook(Module):
         """
         if self.sensor is None or self.plant is None:
             return None
+        # Modes that change what is measured: the filter expects a signal in each.
         if isinstance(self.filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
             signal, weights = self.filter.prior_signals(prior, k)
-            return Moments(weights, signal.mean, jax.vmap(lambda each: each.covariance)(signal))
+            covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
+            return Moments(weights=weights, means=signal.mean, covariances=covariances)
         plant, start = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
-        if isinstance(prior, Diffuse):  # of a linear sensor, which may hear what nobody knows
+        # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
+        if isinstance(prior, Diffuse):
             covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
             noise = jnp.asarray(sensor.noise.covariance)
             mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
@@ -112,7 +115,7 @@ class Outlook(Module):
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
-        return Moments(states.weights, means, covariances)
+        return Moments(weights=states.weights, means=means, covariances=covariances)
 
     def received(self, prior: PyTree, k: jax.Array) -> Moments | None:
         """Return the moments of what would arrive at step k, by the predicted state; None where the filter cannot tell.

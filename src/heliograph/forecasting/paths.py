@@ -108,7 +108,7 @@ def draw_paths(
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
-    # States and modes at the start, then states and outputs in all rows ahead, of which the horizons are kept.
+    # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_starts(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
     x, y = _draw_from_starts(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
@@ -173,13 +173,13 @@ def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Genera
     if not np.isfinite(covariances).all():
         raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
     part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
-    # The mode of each part by its probability there, by inversion of the cumulated ones.
+    # A mode by its probability in the drawn part: the first whose cumulated probability is above a uniform number.
     modes: np.ndarray = np.zeros(draws, dtype=int)
     if isinstance(target.state, ModalBeliefs):
         cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
-        uniform = generator.random(draws)[:, None] * cumulated[:, -1:]
+        uniform = generator.random(draws)[:, None] * cumulated[:, -1:]  # weights of a part need not sum to 1
         modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
-    # A root of the part's covariance times standard normal numbers; attitudes are turned by these.
+    # The state: the part's mean, plus a root of its covariance times standard normal numbers. Attitudes are turned.
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
@@ -217,13 +217,13 @@ def _draw_from_starts(
         plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
         if switching is not None:
             key_of_mode = jax.random.fold_in(key_of_row, 1)
-            mode = switching.draw_next(key_of_mode, mode, u_k, k, k == jnp.asarray(step))
+            mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))
             plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
         x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(key_of_plant, u_k))
         if sensor_k is None:
             return (x, mode), (x, jnp.zeros(0))
-        measuring = sensor_k.under(plant_k.inputs, u_k)
-        y = wrap_angles(measuring.measure(x) + measuring.noise.sample(key_of_sensor), measuring.angles)
+        sensor_k = sensor_k.under(plant_k.inputs, u_k)
+        y = wrap_angles(sensor_k.measure(x) + sensor_k.noise.sample(key_of_sensor), sensor_k.angles)
         return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:  # it takes a second
 
 OUTSIDE = 0.025  # probability beyond each side of a band
 MOST = 20  # outputs of a figure
+WIDTH, HEIGHT_OF_TITLES, HEIGHT_OF_ROW = 9.0, 0.5, 1.9  # inches
+TWO_DEVIATIONS = 2  # about which 95 % of normal residuals lie
 
 
 class Quantiles(NamedTuple):
@@ -57,12 +59,12 @@ def draw_residuals(
     from matplotlib.figure import Figure
 
     count = min(len(names), MOST)
-    figure = Figure(figsize=(9.0, 0.5 + 1.9 * count), layout="constrained")
+    figure = Figure(figsize=(WIDTH, HEIGHT_OF_TITLES + HEIGHT_OF_ROW * count), layout="constrained")
     grid = figure.subplots(count, 3, squeeze=False, width_ratios=[2, 1, 1])
     lags = np.arange(1, len(autocorrelation) + 1)
     for i, (over_time, by_lag, in_order) in enumerate(grid):
         over_time.plot(time, values[:, i], ".", markersize=3, color=COLOURS[0])
-        for level in (-2, 0, 2):
+        for level in (-TWO_DEVIATIONS, 0, TWO_DEVIATIONS):
             over_time.axhline(level, color="0.6", linewidth=0.8, linestyle="-" if level == 0 else ":")
         over_time.set_ylabel(names[i])
         by_lag.bar(lags, autocorrelation[:, i], 0.5, color=COLOURS[0])

@@ -156,7 +156,8 @@ def record_residuals(
 def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: int) -> Residuals | None:
     """Return the residuals of rows (steps, received) and their tests; None where nothing is claimed of what arrives.
 
-    `predicted`: one step ahead, of each row; `angles`: indices of the angles among the received numbers.
+    `predicted`: one step ahead, of each row; `angles`: indices of the angles among the received numbers; `lags`: number
+    of autocorrelations.
     """
     law = predicted.received
     if law is None or law.claim == "none":
@@ -165,7 +166,7 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
     deviation = np.where(np.isfinite(law.deviation), law.deviation, np.nan)
     values = (wrap_near(rows, law.mean, angles) - law.mean) / deviation
     columns = [values[:, i] for i in range(values.shape[1])]
-    counts = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)
+    counts = np.maximum([int(np.sum(~np.isnan(e))) for e in columns], 1)  # that came, at least 1 to divide by
     return Residuals(
         names=law.names,
         values=values,

@@ -98,9 +98,10 @@ def crossing(
     """
     limit = float(scalar("level", level))
     paths = draw_paths(source, horizons, inputs, draws, seed, node, filter)
-    # Shares of the paths that are beyond at each time, and that have been by then.
+    # Shares of the paths that are beyond at each time, and that have been beyond at this or an earlier one.
     is_beyond = paths.is_beyond(name, limit, above)
-    beyond, by = is_beyond.mean(axis=0), np.logical_or.accumulate(is_beyond, axis=1).mean(axis=0)
+    has_been_beyond = np.logical_or.accumulate(is_beyond, axis=1)
+    beyond, by = is_beyond.mean(axis=0), has_been_beyond.mean(axis=0)
     beyond_error, by_error = (np.sqrt(p * (1 - p) / draws) for p in (beyond, by))
     return Crossing(
         name=name,
