@@ -251,8 +251,8 @@ def fit(
     and compare `log_likelihood`. The result is a `SenderFit`.
 
     With `truth` what is maximised is the log density of the true states under the estimates of the network's one
-    filter, its rule and its claim included: for errors that are correlated from row to row, of which the likelihood of
-    the measurements takes the small difference between rows for the whole.
+    filter, its rule and its claim included. Use it where errors are correlated from row to row: the likelihood of the
+    measurements sees how little they change between rows, and takes that for the whole error.
 
     Of an `EventTable`, a bag for example, the rows are in the order of measuring, and `delays` of the result has the
     law of each node's delays: the likelihood of stamps and values is a product, so that each part is learned apart.
@@ -295,7 +295,7 @@ def fit(
         identified = identified.at(solutions[-1])
     except KeyboardInterrupt:  # without these intervals the fit is whole
         stopped = True
-    return Fit(description, tuple(solutions), identified, ends, stopped, delays)
+    return Fit(description, tuple(solutions), identified, ends=ends, stopped=stopped, delays=delays)
 
 
 def _maximise_forms(

@@ -163,7 +163,7 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     `solution`, the maximum of the likelihood.
     """
     names = [parameters.coordinates[i] for i in group.places]
-    if group.fix == len(names):
+    if group.fix == len(names):  # no combination of them is identified
         return f"Nothing in the data tells {_join_names(names)}."
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
     # Products x^a y^b and sums a x + b y that are identified, each with its interval.
@@ -177,7 +177,7 @@ def _describe_group(parameters: Parameters, group: Confounded, solution: "Soluti
     if not combinations:
         return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
     kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
-    if len(group.weights):
+    if len(group.weights):  # then there are no products
         kind = "sum"
     kind += "s" if len(combinations) > 1 else ""
     others = f" and {_count_in_words(unnamed, 'other combination')}" if unnamed else ""

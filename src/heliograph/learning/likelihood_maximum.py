@@ -240,11 +240,10 @@ class Solution:
             return f"{value:>10.4g}  (at the end of its domain)"
         if not self.identifies(slope):
             return f"{value:>10.4g}  (not identified)"
-        with np.errstate(divide="ignore"):
-            center = link(entry.domain, value)
-        half = quantile(np.inf) * error
-        low, high = sorted(float(unlink(entry.domain, center + side * half)) for side in (-1.0, 1.0))
-        row = Row(entry.name, value, low, high, error, self.form, False, True)
+        with np.errstate(divide="ignore"):  # of a value that rounding puts at the end of its domain
+            center = float(link(entry.domain, value))
+            half = quantile(np.inf) * error  # of the normal law: infinitely many degrees of freedom
+            row = self._make_row(entry, value, error, (center - half, center + half))
         return f"{row.value:>10}  (about {row.interval})"
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
@@ -297,7 +296,8 @@ class Solution:
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._cut_profile(coordinate, first, find_allowed_fall(level))
                 return low, high
-            is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])
+            place = np.count_nonzero(self.active[:coordinate])  # of this coordinate among the active ones
+            is_told_by_few = bool(self.few[place])
         center = float(link(entry.domain, value))
         # Blocks drawn anew say nothing of numbers of which a few stretches of the data tell all.
         if method == "bootstrap" and not is_told_by_few:
@@ -308,9 +308,18 @@ class Solution:
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
         """Return the row of an identified number, by its standard error and both ends of its interval on the line."""
-        least, most = sorted(float(unlink(entry.domain, end)) for end in ends)
+        low, high = sorted(float(unlink(entry.domain, end)) for end in ends)
         slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
-        return Row(entry.name, value, least, most, error * slope, self.form, False, True)
+        return Row(
+            name=entry.name,
+            estimate=value,
+            low=low,
+            high=high,
+            standard_error=error * slope,
+            form=self.form,
+            boundary=False,
+            identified=True,
+        )
 
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Return whether the data identify a function of the numbers, which it is if it does not change along ridges.
@@ -357,7 +366,9 @@ class Solution:
         `first`: signed distances from the maximum at which the search for each end begins.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
-        return self.surface.crossings(self.top.x, self.total, coordinate, first, furthest, drop, self.active)
+        return self.surface.crossings(
+            self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
+        )
 
 
 def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:

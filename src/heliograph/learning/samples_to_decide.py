@@ -71,7 +71,8 @@ def samples_to_tell(
     """
     for name, law in (("first law", law_a), ("second law", law_b)):
         instance(name, law, AbstractLaw, "a law such as Rayleigh(1.0)")
-    check_seed("seed", seed), check_count("nodes", nodes)
+    check_seed("seed", seed)
+    check_count("nodes", nodes)
     level = float(scalar("error", error, 0.0, 0.5))
     if level in (0.0, 0.5):
         raise fail("error", "a number between 0 and 0.5", level)
@@ -81,17 +82,21 @@ def samples_to_tell(
     # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     means, deviations = list[float](), list[float]()
+    any_filter = {"open_loop": open_loop_filter(network.plant)}  # of the runs only the measurements are used
     for true, other in (channels, channels[::-1]):
-        world = Network(network.plant, {name: Node(node.sensor, true, {"open_loop": open_loop_filter(network.plant)})})
+        world = Network(network.plant, {name: Node(node.sensor, true, any_filter)})
         z = monte_carlo(world, steps, RUNS, seed, inputs=inputs).measurements[name]
-        log_densities = [_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other)]
-        ratio = np.asarray(log_densities[0] - log_densities[1])  # (runs, steps)
-        means.append(float(ratio.mean()))
-        deviations.append(float(np.sqrt(np.mean([estimate_long_run_deviation(run) ** 2 for run in ratio]))))
-    # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2; no number of steps is enough where the laws look alike.
-    gain = sum(means)
-    needed = (scipy.stats.norm.isf(level) * sum(deviations) / gain) ** 2 if gain > 0 else np.inf
-    return SamplesToTell(float(needed), (means[0], means[1]), (deviations[0], deviations[1]))
+        of_true, of_other = (_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other))
+        log_ratio = np.asarray(of_true - of_other)  # (runs, steps)
+        means.append(float(log_ratio.mean()))
+        deviations.append(float(np.sqrt(np.mean([estimate_long_run_deviation(run) ** 2 for run in log_ratio]))))
+    # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2, with the normal quantile z that is exceeded with probability
+    # `error`; no number of steps is enough where the laws look alike.
+    information = sum(means)
+    needed = (scipy.stats.norm.isf(level) * sum(deviations) / information) ** 2 if information > 0 else np.inf
+    return SamplesToTell(
+        samples=float(needed), information=(means[0], means[1]), deviation=(deviations[0], deviations[1])
+    )
 
 
 def _find_only_node(network: Network) -> tuple[str, Node]:

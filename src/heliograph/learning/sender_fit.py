@@ -21,6 +21,11 @@ from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
+IMPOSSIBLE = -1e300  # log-likelihood of impossible recordings: a search needs a number
+FIRST_REACH = 0.05  # from the maximum towards an end of an interval, on the line
+LARGEST_SIMPLEX = 0.2  # edges of a first simplex, on the line
+MOST_EVALUATIONS = 200  # of a search, for each coordinate
+NORMAL = 1.96  # deviations of a normal law on either side, between which 95 % lie
 FURTHEST = 4.0  # on the line, in logarithms and logits: an interval that reaches so far has no end there
 HALVINGS = 12
 DIGITS = 1e-4  # of the line
@@ -132,11 +137,11 @@ def fit_sender(
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood of all recordings at a point of the line; -1e300 where they are impossible."""
+        """Return the log-likelihood of all recordings at a point of the line."""
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
-        return total if np.isfinite(total) else -1e300
+        return total if np.isfinite(total) else IMPOSSIBLE
 
     # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
@@ -177,8 +182,7 @@ def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " 
     ends = list[_Top]()
     try:
         for point in points:
-            x, total, converged = _climb_simplex(evaluate, np.asarray(point))
-            ends.append(_Top(x, total, converged, stopped=False))
+            ends.append(_climb_simplex(evaluate, np.asarray(point)))
     except KeyboardInterrupt:
         if best is None:
             raise
@@ -198,10 +202,10 @@ def _climb_simplex(
     likelihood: Likelihood,
     start: Float[np.ndarray, " p"],
     enough: float = np.inf,
-    size: float = 0.2,
+    size: float = LARGEST_SIMPLEX,
     digits: float = DIGITS,
-) -> tuple[Float[np.ndarray, " p"], float, bool]:
-    """Return (point, log-likelihood, whether it converged) of a search by Nelder and Mead from `start`.
+) -> "_Top":
+    """Return the best point of a search by Nelder and Mead from `start`.
 
     Args:
         likelihood: the log-likelihood at a point, which is maximised.
@@ -211,10 +215,11 @@ def _climb_simplex(
         digits: edges at which the simplex is small enough; values at its corners then differ by ten times as much.
     """
     at_start = likelihood(start)
-    if not len(start) or at_start > enough:
-        return start, at_start, True
+    if not len(start) or at_start > enough:  # nothing to search, or nothing to improve
+        return _Top(start, at_start, converged=True, stopped=False)
     simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
-    options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": 200 * len(start)}
+    most = MOST_EVALUATIONS * len(start)
+    options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": most}
     climb: Any = minimize  # its types do not know an initial simplex
 
     def stop_above_enough(intermediate_result: Any) -> None:
@@ -225,7 +230,7 @@ def _climb_simplex(
         return -at_start if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
 
     optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop_above_enough)
-    return np.asarray(optimum.x), -float(optimum.fun), bool(optimum.success)
+    return _Top(np.asarray(optimum.x), -float(optimum.fun), converged=bool(optimum.success), stopped=False)
 
 
 def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
@@ -262,7 +267,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
         point[coordinate] += side * profile.find_reach(top.x, side)
         ends.append(float(description.parameters.entries_at(point)[index]))
     low, high = sorted(ends)
-    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * 1.96))
+    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL))
 
 
 class _Top(NamedTuple):
@@ -296,7 +301,7 @@ class _Profile(NamedTuple):
 
         Twice as far each time until the profile is below it, then by bisection.
         """
-        inside, outside = 0.0, 0.05
+        inside, outside = 0.0, FIRST_REACH
         nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
         while outside < FURTHEST:
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)
@@ -316,12 +321,12 @@ class _Profile(NamedTuple):
 
         The first simplex is as large as the two values are apart.
         """
-        size = float(np.clip(abs(value - nearby.value), 10 * NEAR, 0.2))
-        others, highest, _ = _climb_simplex(
+        size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
+        best = _climb_simplex(
             lambda others: self.likelihood(np.insert(others, self.coordinate, value)),
             nearby.others,
             enough=self.level,
             size=size,
             digits=NEAR,
         )
-        return highest > self.level, _ProfilePoint(value, others)
+        return best.total > self.level, _ProfilePoint(value, best.x)

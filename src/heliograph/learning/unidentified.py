@@ -48,9 +48,8 @@ class InformationRank(NamedTuple):
 def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationRank:
     """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
 
-    A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING; a coordinate of which nothing
-    is
-    known is one by itself.
+    A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING. A coordinate of which nothing
+    is known is one by itself.
     """
     diagonal = np.diag(information)
     known = diagonal > 0
@@ -158,7 +157,7 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
             if abs(reduced[pivot, column]) > SAME:
                 break
             column += 1
-        else:
+        else:  # no column is left: the rows from here on are 0
             break
         # Bring it to this row, make it 1, and eliminate its column from all other rows.
         reduced[[row, pivot]] = reduced[[pivot, row]]

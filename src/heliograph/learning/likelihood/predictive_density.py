@@ -140,7 +140,7 @@ def predictive(
     instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
     instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
     check_forgets("channel of a predictive likelihood", channel)
-    # Given that something arrived, as the rows in which nothing did say nothing.
+    # The channel given that something arrived: rows in which nothing did say nothing of the gains.
     received = channel.condition_on_arrival()
     filter = make_signal_filter(plant, sensor, received)
     check_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
@@ -182,7 +182,7 @@ def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
     """Return the combinations of gains and noises with a probability above zero as arrays, one axis over them."""
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
-    return StackPartDensity(np.log(weight), gain, offset, noise)
+    return StackPartDensity(log_weight=np.log(weight), gain=gain, offset=offset, noise=noise)
 
 
 def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: ChannelDensities) -> Predictive:
@@ -205,24 +205,26 @@ def _score_block(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it.
 
+    The transform of a component is its probability integral transform, P(less than what came); NaN where none came.
     y, spread: mean (steps, p) and covariance (steps, p, p) of the signal before each step; z: measurements (steps, m).
     """
-    total, pits, start = np.zeros(len(z)), [], 0
+    log_density, transforms, start = np.zeros(len(z)), [], 0
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
         log_weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
-        # The transform: P(less than what came) = sum_a P(a | components before) Phi(error of it in combination a).
+        # The transform is sum_a P(a | components before) Phi(error of it in combination a of gains).
         for j in range(stop - start):
             weight = np.exp(log_weight[..., j] - logsumexp(log_weight[..., j], axis=1, keepdims=True))
-            pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(weight * ndtr(error[..., j]), axis=1)))
-        # log p of the part, and the signal given it, for the next part.
-        density = logsumexp(log_weight[..., -1], axis=1)
-        total += density
+            below = np.sum(weight * ndtr(error[..., j]), axis=1)
+            transforms.append(np.where(np.isnan(z[:, start + j]), np.nan, below))
+        # The part's log-density, and the signal given it, for the next part.
+        of_part = logsumexp(log_weight[..., -1], axis=1)
+        log_density += of_part
         if i + 1 < len(parts):
-            posterior = np.exp(log_weight[..., -1] - density[:, None])
+            posterior = np.exp(log_weight[..., -1] - of_part[:, None])
             y, spread = _correct_signal(y, spread, z[:, start:stop], law, posterior)
         start = stop
-    return total, np.stack(pits, axis=1)
+    return log_density, np.stack(transforms, axis=1)
 
 
 def _weigh_combinations(

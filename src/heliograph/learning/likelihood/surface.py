@@ -152,13 +152,13 @@ class LikelihoodSurface:
         evaluation, places = self.evaluations(x[None]), np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(places, places)]
         gradient = evaluation.gradient[0][places]
-        # Directions in which the information, in units of standard errors, is above zero, in columns.
+        # The directions that the data identify, in columns: the information in units of standard errors is above FLAT.
         unit = np.where(np.diag(information) > 0, 1 / np.sqrt(np.maximum(np.diag(information), TINY)), 0.0)
         eigenvalues, directions = np.linalg.eigh(information * unit[:, None] * unit)
         basis = unit[:, None] * directions[:, eigenvalues > FLAT]
         if not basis.size:
             return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
-        # The Hessian along these; where it is not finite nothing is known of the gain.
+        # The Hessian along these; where it is not finite nothing is known of the gain, which may be any.
         observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
         if not np.isfinite(observed).all():
             return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
@@ -168,7 +168,7 @@ class LikelihoodSurface:
         # g' |H|^-1 g / 2, in the Hessian's eigenvectors.
         slopes = vectors.T @ basis.T @ gradient
         gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
-        return Curvature(float(curvatures[0]), direction, gain)
+        return Curvature(least=float(curvatures[0]), direction=direction, gain=gain)
 
     def crossings(
         self,
@@ -191,7 +191,7 @@ class LikelihoodSurface:
             top: l there.
             coordinate: index of the coordinate whose profile is followed.
             first: signed distances at which to begin, one for each end that is sought (lanes,).
-            furthest: distance at which a profile that has not fallen is taken never to: the end is infinite.
+            furthest: distance of an end that is taken for infinite: the profile has not fallen enough up to it.
             drop: fall of l at the ends, in nats.
             active: coordinates that are inside their domains (p,).
 
@@ -205,7 +205,7 @@ class LikelihoodSurface:
         for _ in range(CUTS):
             # The profile at these distances: l with the other coordinates at their best.
             points[:, coordinate] = x[coordinate] + side * distance
-            climbed = maximise(self.evaluate, points, moving, None, self.domains, ENOUGH)
+            climbed = maximise(self.evaluate, points, moving, domains=self.domains, close=ENOUGH)
             with np.errstate(over="ignore"):  # of an infinite fall
                 fall = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
             # Narrow the bracket: `inside` has not fallen to the target, `outside` has fallen further.
@@ -215,10 +215,12 @@ class LikelihoodSurface:
             # Done where the fall is the target, the bracket is closed, or the profile has not fallen at `furthest`.
             is_there = np.abs(fall - target) < EXACT * target
             never_falls = ~is_beyond & (distance >= furthest)
-            done = is_there | never_falls | (outside - inside < EXACT * EXACT * outside)
+            is_closed = outside - inside < EXACT * EXACT * outside
+            done = is_there | never_falls | is_closed
             if done.all():
                 return np.asarray(x[coordinate] + side * np.where(never_falls & ~is_there, np.inf, distance))
-            # Newton's next distance: df/dt = -side dl/dx / f, and dl/dx of the profile is that of l.
+            # Newton's next distance: df/dt = -side dl/dx / f. The profile has the slope dl/dx of l, as the other
+            # coordinates are at their best.
             with np.errstate(all="ignore"):
                 newton = distance + (target - fall) * fall / (-side * climbed.gradient[:, coordinate])
             distance = np.where(done, distance, _choose_distance(newton, distance, inside, outside, furthest))

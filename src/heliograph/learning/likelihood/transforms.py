@@ -43,17 +43,19 @@ def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
     # A covariance L L', with the entries of L row by row, those on its diagonal by their logarithms.
     if domain.kind == "covariance":
         factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
-        factor = jnp.where(np.eye(shape[0], dtype=bool), jnp.exp(jnp.diag(jnp.diag(factor))), factor)
+        of_diagonal = jnp.exp(jnp.diag(jnp.diag(factor)))  # of the diagonal alone, as other entries might overflow
+        factor = jnp.where(np.eye(shape[0], dtype=bool), of_diagonal, factor)
         return factor @ factor.T
     # An interval: by the logistic function between two ends, an exponential from one, as it is without ends.
     xp = library(x)
     coordinates: Array = xp.reshape(x, shape)
     has_low, has_high = np.isfinite(domain.low), np.isfinite(domain.high)
     if has_low and has_high:
-        return domain.low + (domain.high - domain.low) * (expit if xp is np else jax.nn.sigmoid)(coordinates)
+        logistic = expit if xp is np else jax.nn.sigmoid
+        return domain.low + (domain.high - domain.low) * logistic(coordinates)
     if not (has_low or has_high):
         return coordinates
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # to infinity, far from the end
         distance: Array = xp.exp(coordinates)
     return domain.low + distance if has_low else domain.high - distance
 

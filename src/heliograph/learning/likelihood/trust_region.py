@@ -236,7 +236,7 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     step, length, foretold = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
     )
-    tried = np.where(going[:, None], state.x + step, state.x)
+    tried = np.where(going[:, None], state.x + step, state.x)  # lanes that are done stay
     total, gradient, information = _evaluate_lanes(evaluate, tried, going, state)
     # Accept it or not, and adapt the radius, by how well the gain was foretold.
     is_finite = going & _is_finite(total, gradient, information, moving)
@@ -293,10 +293,10 @@ def _judge_step(
 def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
     """Return the state in which each lane a is ended that climbs to the same top as a higher lane b: b is enough.
 
-    By the information I of either, both are within JOINED standard errors of a top and of each other, and neighbours in
-    every logarithm and logit. On the way d from a to b the log-likelihood rises as the gradients g at both ends say,
-    (g_a + g_b)' d / 2, exact of a quadratic, and bends down, (g_a - g_b)' d, by BENT of d' I d at least: between them
-    is no saddle. `moving`: coordinates that move (lanes, p).
+    Both are within JOINED standard errors of a top and of each other, by the information I of either, and neighbours in
+    every logarithm and logit. There is no saddle on the way d from a to b: the log-likelihood rises by what the
+    gradients g at both ends say, (g_a + g_b)' d / 2, as a quadratic does, and bends down by (g_a - g_b)' d, which is at
+    least BENT of d' I d. `moving`: coordinates that move (lanes, p).
     """
     lanes, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from lane a to lane b, (a, b, p)
@@ -307,13 +307,13 @@ def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
     gain = state.total[None] - state.total[:, None]
     foretold = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     bend = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    # Both lanes are close to a top, and it is the same one.
+    # Both are within JOINED standard errors of a top (2 * remaining is the square of how far), and it is the same one.
     near_top = (2 * state.remaining < JOINED**2) & (state.joined == lanes)
     neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
     neighbours &= np.all(moving[:, None] == moving[None], axis=2)
     no_saddle = (np.abs(gain - foretold) <= ALIKE * gain + NOISE * np.abs(state.total)) & (bend >= BENT * distance)
     same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
-    # The higher one goes on; of two that are as high the first.
+    # [a, b] is true where b goes on: the higher one, of two that are as high the first.
     is_higher = same_top & ((gain > 0) | ((gain == 0) & (lanes[None] < lanes[:, None])))
     joins = ~state.done & np.any(is_higher, axis=1)
     best = np.argmax(np.where(is_higher, state.total[None], -np.inf), axis=1)

@@ -1,5 +1,7 @@
 """One step of a trust-region search, of many lanes at once: the best point of a quadratic model within a radius."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from heliograph.numerics.types import Bool, Float
@@ -13,6 +15,14 @@ LEAST = 1e-150  # information, of which the square is a number
 LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
 
 
+class TrustRegionStep(NamedTuple):
+    """Steps p of all lanes, their lengths |D p|, and the gains that the model foretells, g' p - p' B p / 2."""
+
+    step: Float[np.ndarray, "lanes p"]
+    length: Float[np.ndarray, " lanes"]
+    foretold: Float[np.ndarray, " lanes"]
+
+
 def trust_region_step(
     gradient: np.ndarray,
     information: np.ndarray,
@@ -20,14 +30,16 @@ def trust_region_step(
     radius: np.ndarray,
     moving: np.ndarray,
     free: np.ndarray,
-) -> tuple[Float[np.ndarray, "lanes p"], Float[np.ndarray, " lanes"], Float[np.ndarray, " lanes"]]:
+) -> TrustRegionStep:
     """Return the step p that maximises g' p - p' B p / 2 over |D p| <= radius, its length |D p|, and the gain at p.
 
-    p = (B + s D^2)^-1 g with the least s >= 0 for which B + s D^2 is not indefinite and |D p| <= radius, by Newton's
-    method for 1 / |D p| = 1 / radius. All is computed in units u of standard errors, in which B is of order 1:
-    D = max(1, radius u / LONGEST) where a logarithm moves, so that it moves by LONGEST at most, else D = 1. A matrix
-    that is scaled by a diagonal is solved as exactly as without. To B is added v v' for each direction v that is not
-    identified, whose gradient is but rounding.
+    It is p = (B + s D^2)^-1 g. The shift s >= 0 is the least for which B + s D^2 is not indefinite and |D p| <= radius;
+    it is found by Newton's method for 1 / |D p| = 1 / radius.
+
+    All is computed in units u of standard errors, in which B is of order 1; scaled by a diagonal, a matrix is solved as
+    exactly as without. D is 1, but max(1, radius u / LONGEST) where a logarithm moves, so that it moves by LONGEST at
+    most. To B is added v v' for each direction v that is not identified: its gradient is but rounding, and would else
+    lead far.
 
     Args:
         gradient: g (lanes, p).
@@ -41,8 +53,8 @@ def trust_region_step(
     Returns:
         p (lanes, p), |D p| (lanes,) and g' p - p' B p / 2 (lanes,).
     """
-    # g, D and B in standard errors; a coordinate that stays has a unit of 0, and 1 on the diagonals of D and B. Columns
-    # of `flat` are the directions that are not identified, in these units.
+    # g, D and B in standard errors. A coordinate that stays has a unit of 0 and 1 on the diagonals of D and B, so that
+    # its step is 0. Columns of `flat` are the directions that are not identified, in these units.
     unit, flat = find_flat_directions(information, moving)
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
@@ -52,11 +64,11 @@ def trust_region_step(
     # The step on or within the radius; one that is up to a hundredth longer is shortened to it.
     step = _find_step_within(radius, g, b, d)
     length = np.linalg.norm(d * step, axis=1)
-    shortened = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * shortened[:, None], length * shortened
+    factor = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
+    step, length = step * factor[:, None], length * factor
     # What the model gains there: g' p - p' B p / 2.
     foretold = np.sum(step * (g - multiply_lanes(b, step) / 2), axis=1)
-    return step * unit, length, foretold
+    return TrustRegionStep(step=step * unit, length=length, foretold=foretold)
 
 
 def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:

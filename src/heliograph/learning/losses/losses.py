@@ -67,18 +67,21 @@ class LossMemory(NamedTuple):
             ValueError: what is no fates (see `heliograph.learning`).
         Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
         """
-        # The likelihood ratio of a chain of order one and independent losses.
+        # The likelihood ratio of a chain, whose losses depend on the packet before, and of independent losses: those
+        # have one law for both rows of the counts.
         counts = MarkovLosses.fit(fates, intervals=False).counts
         both = counts.sum(axis=0)
         ratio = max(2 * (_compute_maximum_log_likelihood(counts) - _compute_maximum_log_likelihood(both[None])), 0.0)
-        # Wald and Wolfowitz: the number of runs less its mean 1 + 2 n1 n0 / n, given n1 losses of n, and its variance.
+        # Wald and Wolfowitz: of n packets, n1 lost and n0 arrived, the number of runs of equal fates has the mean
+        # 1 + 2 n1 n0 / n. `excess` is how many more there are, with its variance, over all unbroken stretches.
         excess, variance = 0.0, 0.0
         for stretch in check_fates(fates):
             # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
             for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
                 n, losses = len(lost), float(lost.sum())
-                pairs = 2 * losses * (n - losses)
-                excess += 1 + np.sum(np.diff(lost) != 0) - (1 + pairs / n)
+                pairs = 2 * losses * (n - losses)  # 2 n1 n0
+                runs = 1 + np.sum(np.diff(lost) != 0)
+                excess += runs - (1 + pairs / n)
                 variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
         z = float(excess / np.sqrt(variance)) if variance > 0 else 0.0
         return cls(

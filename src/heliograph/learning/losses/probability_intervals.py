@@ -13,6 +13,9 @@ FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half th
 # The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.
 FALL_AT_END = 2.995732
 END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
+FIRST_STEP = 0.25  # of a logit, from the maximum towards an end of an interval
+LOGIT_ACCURACY = 1e-3  # of an end
+PROFILE_ACCURACY = 1e-9  # relative, of a log-likelihood on a profile
 
 LogLikelihood = Callable[[np.ndarray], tuple[float, np.ndarray]]  # logits (p,) -> its value and gradient (p,)
 
@@ -82,13 +85,15 @@ def _find_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: in
     def height_above_level(logit_of_share: float) -> float:
         """Return how far the profile at this logit is above the level."""
         nonlocal nearby
-        best_others, profile = maximise_shares(_fix_logit(function, i, logit_of_share, others), [nearby], 1e-9)
+        best_others, profile = maximise_shares(
+            _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
+        )
         if profile > level:
             nearby = best_others
         return profile - level
 
     # The maximum itself, if it is below by rounding; an end of the domain, if the profile is above the level there.
-    inside, step = float(top[i]), 0.25
+    inside, step = float(top[i]), FIRST_STEP
     if height_above_level(inside) <= 0:
         return float(expit(inside))
     if height_above_level(side * END) >= 0:
@@ -96,7 +101,7 @@ def _find_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: in
     # A bracket by doubled steps from the maximum, then Brent's method.
     while height_above_level(outside := float(np.clip(inside + side * step, -END, END))) > 0:
         inside, step = outside, 2 * step
-    return float(expit(brentq(height_above_level, inside, outside, xtol=1e-3)))
+    return float(expit(brentq(height_above_level, inside, outside, xtol=LOGIT_ACCURACY)))
 
 
 def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray) -> LogLikelihood:

@@ -239,8 +239,7 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
     """Return masks (steps, free) of the hops that send at a start: all, and then choices of the paths that send.
 
     They are every choice if there are at most `starts`, else as many as are drawn. A convex problem has one minimum,
-    and
-    one start. `path`: number of the path of each free hop.
+    and one start. `path`: number of the path of each free hop.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):
