@@ -100,7 +100,8 @@ def find_target(origin: Origin, node: str | None, filter: str | None) -> Forecas
     found = [t for t in every if node in (None, t.node) and filter in (None, t.filter)]
     if len(found) != 1:
         known = ", ".join(f"{t.node}/{t.filter}" for t in every)
-        raise fail("node and filter", f"one of {known}", "none" if node is filter is None else f"{node}/{filter}")
+        asked = "none" if node is None and filter is None else f"{node}/{filter}"
+        raise fail("node and filter", f"one of {known}", asked)
     return found[0]
 
 
@@ -113,14 +114,16 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     if isinstance(model, AbstractFilter):
         outlook = make_outlook(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
-        return [ForecastTarget("", "", outlook, origin.state, name_values(outputs, model.received))]
+        received = name_values(outputs, model.received)
+        return [ForecastTarget(node="", filter="", outlook=outlook, state=origin.state, received=received)]
     assert isinstance(model, Network)
     targets = []
     for node, filters in origin.estimates.items():
         for name, estimate in filters.items():
             filter, state = _find_filter(model, origin, node, name, estimate)
             outlook = make_outlook(filter, _find_sensor(model, node), model.plant)
-            targets.append(ForecastTarget(node, name, outlook, state, _name_received(model, node)))
+            received = _name_received(model, node)
+            targets.append(ForecastTarget(node=node, filter=name, outlook=outlook, state=state, received=received))
     return targets
 
 
@@ -212,5 +215,11 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
     arriving = received and prediction_of(received, target.received, claim, angles.received)
-    whole = prediction_of(states, filter.states, claim, angles.states)
-    return Forecast(ahead.steps, ahead.time, whole, measured, arriving, ahead.inputs)
+    return Forecast(
+        steps=ahead.steps,
+        time=ahead.time,
+        states=prediction_of(states, filter.states, claim, angles.states),
+        outputs=measured,
+        received=arriving,
+        inputs=ahead.inputs,
+    )

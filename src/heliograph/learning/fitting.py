@@ -98,17 +98,17 @@ class Fit:
     @property
     def aic(self) -> float:
         """Akaike's information criterion, 2 k - 2 l; the smaller the better."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[0]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).aic
 
     @property
     def aicc(self) -> float:
         """Akaike's criterion for few data: + 2 k (k + 1) / (n - k - 1)."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[1]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).aicc
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, k log n - 2 l."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations)[2]
+        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).bic
 
     def likelihood_ratio(self, smaller: "Fit") -> FitTest:
         """Test a model with some of the free numbers fixed, fitted to the same data: 2 (l - l_0) is chi-square.

@@ -26,7 +26,10 @@ LAGS = 10  # of the test for memory, with ten rows for each at least
 class PredictedRows:
     """Predictions of some rows by one filter: log-likelihoods, white innovations and the test of their memory.
 
-    Shapes: log_likelihood (rows,), white (rows, received) in claimed deviations; the test is None for too few rows.
+    White innovations are divided by their claimed deviations and made uncorrelated within a row: all are of variance 1
+    and independent where the filter is right.
+
+    Shapes: log_likelihood (rows,), white (rows, received); the test is None for too few rows.
     """
 
     log_likelihood: Float[np.ndarray, " rows"]
@@ -105,11 +108,11 @@ def compare_filters(
                 continue
             old = _predict_rows(old_filter, z, inputs, cut)
             new = _predict_rows(after.nodes[name].filters[key], z, inputs, cut)
-            received = ~np.all(np.isnan(old.white), axis=1)
+            received = ~np.all(np.isnan(old.white), axis=1)  # rows in which anything arrived
             gain = None
             if received.sum() >= LAGS:
                 gain = compare_mean((new.log_likelihood - old.log_likelihood)[received])
-            results.append(Change(name, key, old, new, gain))
+            results.append(Change(node=name, filter=key, before=old, after=new, gain=gain))
     return results
 
 
@@ -126,9 +129,9 @@ def transform_held_out(
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
         by_law = _transform_by_laws(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
-            uniform.append(Uniformity(name, by_law[cut:], True))
+            uniform.append(Uniformity(name, by_law[cut:], by_law=True))
         elif of_node:
-            uniform.append(Uniformity(name, np.asarray(ndtr(of_node[0].after.white)), False))
+            uniform.append(Uniformity(name, np.asarray(ndtr(of_node[0].after.white)), by_law=False))
     return uniform
 
 
@@ -181,4 +184,5 @@ def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
     """Return the test of whether the mean of differences (steps,), correlated over time, is zero."""
     mean, error = estimate_mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
-    return Comparison(mean, error, float(z), float(2 * scipy.stats.norm.sf(abs(z))))
+    p_value = float(2 * scipy.stats.norm.sf(abs(z)))
+    return Comparison(difference=mean, standard_error=error, z=float(z), p_value=p_value)

@@ -85,7 +85,15 @@ def wald_test(
     return chi_square_test(float(distance @ np.linalg.solve(inner, distance)), len(places))
 
 
-def information_criteria(log_likelihood: float, free: int, observations: int) -> tuple[float, float, float]:
+class InformationCriteria(NamedTuple):
+    """Criteria by which models are compared, the smaller the better: of Akaike, the same for few data, of Schwarz."""
+
+    aic: float
+    aicc: float
+    bic: float
+
+
+def information_criteria(log_likelihood: float, free: int, observations: int) -> InformationCriteria:
     """Return AIC, AICc and BIC; AICc is infinite where numbers are as many as data.
 
     Args:
@@ -96,5 +104,8 @@ def information_criteria(log_likelihood: float, free: int, observations: int) ->
     check_count("observations", observations)
     aic = 2 * free - 2 * log_likelihood
     left = observations - free - 1
-    corrected = aic + 2 * free * (free + 1) / left if left > 0 else float("inf")
-    return aic, corrected, free * float(np.log(observations)) - 2 * log_likelihood
+    return InformationCriteria(
+        aic=aic,
+        aicc=aic + 2 * free * (free + 1) / left if left > 0 else float("inf"),
+        bic=free * float(np.log(observations)) - 2 * log_likelihood,
+    )

@@ -117,7 +117,7 @@ class SumTask(NamedTuple):
             first: amplitudes at which the first descent begins (links,); none unless given.
         """
         links, free = self.links, self.free
-        # The free amplitudes are searched as x = a / scale in [-1, 1], the scale being the most that limits allow.
+        # The free amplitudes a are searched as x = a / scale in [-1, 1], the scale being the most that limits allow.
         scale = np.minimum(self.caps[free], np.sqrt(total / links.unit[free]))
         if not np.all(np.isfinite(scale)):
             raise fail("budget", "one that limits every transmitter", "no limit")
@@ -133,10 +133,11 @@ class SumTask(NamedTuple):
         def error_at(x: Vector) -> float:
             return self.compute_error(amplitudes_at(x))
 
-        generator, best, least = np.random.default_rng(self.seed), links.present, np.inf
+        generator = np.random.default_rng(self.seed)
         points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
         if first is not None:
             points = [np.divide(first[free], scale, out=np.zeros_like(scale), where=scale > 0), *points]
+        best, least = links.present, np.inf
         for point in points:
             result = scipy.optimize.minimize(error_at, point, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
             if result.fun < least:
@@ -156,8 +157,9 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     Raises:
         ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
     """
-    (name, node), error = next(iter(network.nodes.items())), problem.criterion
-    assert isinstance(node, Node)
+    ((name, node),) = network.nodes.items()
+    error = problem.criterion
+    assert isinstance(node, Node)  # by `adds_up`
     assert isinstance(node.channel, Superposed)
     if error.steps > 1:
         raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
@@ -306,13 +308,14 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
         ValueError: a sensor or a sum that the formulas do not cover.
     """
     sensor, channel = _check_sum(node)
-    # The sum in which each transmitter sends what it measures.
+    # The sum in which each transmitter sends what it measures (an amplification of None).
     unit = channel
     for hop in transmitter_names(channel):
         amplified = amplify_transmitter(unit, hop, None)
         assert isinstance(amplified, Superposed)
         unit = amplified
-    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver.
+    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver. The
+    # centre of second moments is Cov of (g, n) x (g, n): [0, 0, 0, 0] is Var g, [0, 0, -1, -1] is Var n.
     moments = [second_order(link) for link in unit.maps]
     mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
     variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
@@ -321,8 +324,8 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     outputs = [of_link[0] for of_link in channel.places]
     power = np.array(list(compute_sent_powers(unit, second).values()))
     sensor_noise = np.asarray(sensor.noise.covariance)[np.ix_(outputs, outputs)]
-    # Present amplitudes: sizes from powers, signs from mean gains.
-    present = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
+    # Present amplitudes: sizes from powers, signs from mean gains, beside those of unit amplitudes.
+    sizes = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
     present_gains = np.array([float(second_order(link).mean_gain[0, 0]) for link in channel.maps])
     signs = np.sign(present_gains) * np.sign(mean)
     links = SummedLinks(
@@ -330,7 +333,7 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
         noise=np.outer(mean, mean) * sensor_noise + np.diag(variance * power),
         unit=power,
         floor=floor,
-        present=np.where(signs == 0, 1.0, signs) * present,
+        present=np.where(signs == 0, 1.0, signs) * sizes,
     )
     return links, unit
 

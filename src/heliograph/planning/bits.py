@@ -85,8 +85,12 @@ def design_bits(network: Network, total: int) -> BitsDesign:
         for name, node, count in zip(names, nodes, bits, strict=True)
         if count and node.encoder is not None
     }
-    found = {name: int(count) for name, count in zip(names, bits, strict=True)}
-    return BitsDesign(found, error, min(_bound_by_relaxation(senders, budget), error), encoders)
+    return BitsDesign(
+        bits={name: int(count) for name, count in zip(names, bits, strict=True)},
+        error=error,
+        bound=min(_bound_by_relaxation(senders, budget), error),
+        encoders=encoders,
+    )
 
 
 def _describe_senders(network: Network) -> _Senders:
@@ -179,6 +183,7 @@ def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[n
     before = senders.transition @ p @ senders.transition.T + senders.process
     m = p @ np.linalg.pinv(before) @ senders.transition
     y = solve_discrete_lyapunov(m.T, np.eye(len(m)))
+    # Row i of `rows @ p` is c_i' P, so that the sum is (c_i' P) Y (P c_i).
     slopes: np.ndarray = -np.einsum("in,nk,im,mk->i", senders.rows @ p, y, senders.rows @ p, np.eye(len(p)))
     return slopes
 

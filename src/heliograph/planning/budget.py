@@ -82,9 +82,8 @@ class PowerLimits(NamedTuple):
     def find_best_powers(self, gain: Powers) -> Powers:
         """Return the allowed powers q (time, free) with the largest sum of gain * q.
 
-        They are zero where the gain is not positive. Limits are nested (an entry, its column, all), so entries are
-        filled
-        greedily, the largest gain first.
+        They are zero where the gain is not positive. Limits are nested (an entry, its column, all), so that entries
+        are filled greedily, the largest gain first.
         """
         powers, steps = np.zeros_like(gain), len(gain)
         # What the limits of the total and of each transmitter leave, as sums over time.
@@ -167,7 +166,7 @@ def make_power_limits(
     peak_limit = _limit_each("peak", budget.peak, names)
     total_limit = np.inf if budget.total is None else budget.total
     # What is not free has to be within the limits, and takes its part of the total.
-    fixed = np.where(free, 0.0, powers)
+    fixed = np.where(free, 0.0, powers)  # (time, hop)
     fixed_mean, fixed_peak = fixed.mean(axis=0), fixed.max(axis=0)
     for name, sent, limit in zip(names, fixed_mean, mean_limit, strict=True):
         _check_sent(f"power of {name!r}", sent, limit)

@@ -114,7 +114,7 @@ def error_over_sites(
     instance("design", best, PowerDesign, "a PowerDesign")
     function("network of a map", build, "x and y")
     columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
-    # The design is made again at each place, from few starts, since errors are compared and nothing is built.
+    # The design is made again at each place. A few starts are enough, since errors are only compared.
     problem = best.problem.replace_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
     errors = np.zeros((len(rows), len(columns)))
@@ -179,7 +179,7 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
     """
     senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
-    free = None if problem.free is None else tuple(problem.free)
+    free = None if problem.free is None else tuple(problem.free)  # names of transmitters or nodes; None: all are free
 
     def with_nodes(nodes: dict[str, Node], free: tuple[str, ...] | None) -> DesignProblem:
         return replace(problem, network=Network(network.plant, nodes), free=free)
@@ -190,12 +190,13 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
         twin = f"{name} again"
         with_twin = None if free is None else (*free, twin)
         problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)
-        # The sensor left out, unless nothing is left or nothing is free then. A target error is one of all sensors.
+        # The sensor left out, unless nothing is left or nothing is free then. With a target error it is not tried, as
+        # that is one of all sensors.
         still_free = None if free is None else tuple(each for each in free if _name_node(each) != name)
         if len(nodes) > 1 and still_free != () and problem.target_error is None:
             rest = {other: other_node for other, other_node in nodes.items() if other != name}
             problems[f"without {name}"] = with_nodes(rest, still_free)
-        # A relay in each hop. Hops behind it are counted anew, so that nodes are free as a whole.
+        # A relay in each hop. It changes the numbers in the names of hops behind it, so that nodes are free as a whole.
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
             free_nodes = None if free is None else tuple(dict.fromkeys(_name_node(each) for each in free))
             for hop in transmitter_names(node.channel):

@@ -50,6 +50,14 @@ class MessageRate(NamedTuple):
     error_error: np.ndarray
 
 
+class _Cells(NamedTuple):
+    """Grid of cells: how many lie on either side of 0, how many reach from a cell to delta, and their length."""
+
+    each_side: int
+    of_delta: int
+    length: float
+
+
 class _ScalarSystem(NamedTuple):
     """Linear plant and sensor of one number each: x+ = a x + N(0, q), y = c x + N(0, r)."""
 
@@ -223,8 +231,8 @@ def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
     return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
-def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> tuple[int, int, float]:
-    """Return how many cells lie on either side of 0, how many reach from a cell to delta, and their length.
+def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _Cells:
+    """Return the grid of cells for a state and a value sent last.
 
     Cells are at most `share` of the deviation of either noise, in units of the state.
 
@@ -243,7 +251,7 @@ def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> tuple[in
             f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
             f"{cells_each_side / 5.5:.3g} times",
         )
-    return cells_each_side, cells_of_delta, h
+    return _Cells(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
 
 
 def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
@@ -254,9 +262,9 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     longer than `share` of the lesser noise's deviation.
     """
     a, q, r = system.a, system.q, system.r
-    cells_each_side, cells_of_delta, h = _choose_cells(system, delta, share)
+    cells = _choose_cells(system, delta, share)
     # Probabilities of a cell given the middle of another: move[new, old] of x after a step, noise[x, z] of z given x.
-    x = np.arange(-cells_each_side, cells_each_side + 1) * h
+    x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
     move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
     # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
     quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
@@ -265,7 +273,7 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     def move_and_send(vector: np.ndarray) -> np.ndarray:
         """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
         f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + _send_part(f, noise, cells_of_delta)).ravel()
+        return np.asarray(f * quiet + _send_part(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
@@ -278,7 +286,7 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_send_part(move @ f, noise, cells_of_delta).sum()), h
+    return float(_send_part(move @ f, noise, cells.of_delta).sum()), cells.length
 
 
 def _send_part(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:

@@ -121,10 +121,11 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     else:
         limits = make_power_limits(check_budget(problem.budget), paths.names, free, present_powers)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
+    # A target error, or None: then the least error within the budget is sought.
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)
-    is_network = isinstance(network, Network)
-    present_error = task.problem.exact(present_powers[:, free]) if is_network else float("nan")
+    sends_already = isinstance(network, Network)
+    present_error = task.problem.exact(present_powers[:, free]) if sends_already else float("nan")
     return design_paths(problem, task, target, present_error)
 
 
@@ -151,18 +152,19 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
         ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
     """
     power_limit = _check_relay_problem(problem)
-    # Errors (slots, n, n) of the designed gains, and of those that minimise each relay's error.
+    # Error covariances (slots, n, n) with the designed gains, and with those that minimise each relay's own error.
     gains = periodic_relays_for_best_receiver(relays, power_limit=power_limit)
     local_gains = periodic_local_error_design(relays).gains
     covariance, local_covariance = (periodic_behind_relays(relays, design) for design in (gains, local_gains))
     value, present = (float(np.trace(p, axis1=1, axis2=2).mean()) for p in (covariance, local_covariance))
-    # What relays send does not depend on the receiver, whose gains are zero; the sensor sends in slots with a link.
+    # What relays send does not depend on the receiver, whose gains may be zero. The sensor sends in slots in which
+    # anyone receives it, each time with the power E y'y.
     slots, n = len(relays.slots), len(relays.states)
     receiver_gains = {RECEIVER: np.zeros((slots, n, relays.received[-1]))}
     powers = periodic_given_design(relays, gains | receiver_gains).power
     measured = measurement_moment(relays.sensor, steady_moment(relays.plant))  # E (y, 1)(y, 1)'
     sensor_sends = [any(SENSOR in links for links in slot.values()) for slot in relays.slots]
-    # One descent of a problem that is not convex: no bound, and no linear model of the error.
+    # One descent of a problem that is not convex: no bound is known, and no tangent of the error is computed.
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=float("nan"), starts=1, unit="error"
     )

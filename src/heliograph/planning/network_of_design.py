@@ -57,9 +57,9 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     for name, node in nodes.items():
         by_step: list[AbstractRandomAffine] = []
         for k, second in enumerate(seconds):
-            measured = measurement_moment(node.sensor, second, k)
-            of_node = _select_node(name, powers, k)
-            by_step.append(set_transmitter_powers(at(node.channel, k), measured, of_node, k))
+            measured = measurement_moment(node.sensor, second, k)  # E (y, 1)(y, 1)'
+            powers_of_node = _select_node(name, powers, k)
+            by_step.append(set_transmitter_powers(at(node.channel, k), measured, powers_of_node, k))
         channels[name] = _make_over_time(by_step)
     designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}

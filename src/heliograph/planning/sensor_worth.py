@@ -124,9 +124,9 @@ def worth_of_sensors(
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
     cases = list(_list_cases([*nodes], [*added], steps, without, table("outages", outages or {}, "steps")))
-    # One filter of all that is received, additions included, and one set of draws.
-    every = {**nodes, **{name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}}
-    bare = {name: Node(node.sensor, node.channel, {}) for name, node in every.items()}
+    # One filter of all that is received, additions included, and one set of draws, by nodes without their own filters.
+    added = {name: instance(f"addition {name!r}", node, Node, "a Node") for name, node in added.items()}
+    bare = {name: Node(node.sensor, node.channel, {}) for name, node in {**nodes, **added}.items()}
     filter_of_all = _make_filter_of_all(network, bare)
     is_exact = filter_of_all.claim == "exact"
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs), key, inputs=inputs)
@@ -136,9 +136,9 @@ def worth_of_sensors(
     sizes = [bare[name].received for name in bare]
     errors: list[ErrorWithout] = []
     for case in cases:
-        used = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
-        squares = _compute_squares_at_end(filter_of_all, used, u, truth, is_exact)
-        errors.append(_describe_error(case.name, squares, errors[0].error if errors else None))
+        z_of_case = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
+        squares = _compute_squares_at_end(filter_of_all, z_of_case, u, truth, is_exact)
+        errors.append(_describe_error(case.name, squares, complete=errors[0].error if errors else None))
     return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=is_exact, added=tuple(added))
 
 
@@ -186,13 +186,13 @@ def _list_cases(
         without: nodes that are left out, each by itself; None for each of several.
         outages: for how many steps at the end a node is out, by its name.
     """
-    each_of_several = names if len(names) > 1 else []
+    each_of_several = names if len(names) > 1 else []  # without a single one nothing would be received
     left_out = each_of_several if without is None else items("nodes left out", without, "names")
     for what, asked in (("nodes left out", left_out), ("outages", outages)):
         for name in asked:
             if name not in names:
                 raise fail(what, f"some of the nodes {', '.join(names)}", repr(name))
-    # Which values are used (steps, nodes): those of the network's nodes, not those of additions.
+    # Which values are used (steps, nodes), additions last: those of the network's nodes, not those of additions.
     base = np.tile(np.isin([*names, *added], names), (steps, 1))
     yield _SensorCase("all", base)
     for name in left_out:

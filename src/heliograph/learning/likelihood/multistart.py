@@ -105,9 +105,8 @@ class MaximumSearch:
 
         While it is none it climbs again, ROUNDS times at most; then the point says why it is none.
 
-        A maximum: g' H^-1 g is nothing, with the gradient g of the log-likelihood l and the Hessian H of -l, which is
-        not
-        indefinite, among the numbers inside their domains; at an end l does not rise inwards.
+        A point is a maximum if g' H^-1 g is nothing among the numbers inside their domains, with the gradient g of the
+        log-likelihood l and the Hessian H of -l, which is not indefinite; and if l does not rise inwards at any end.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best(climbed, no_ends)
@@ -202,9 +201,8 @@ class MaximumSearch:
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
         """Return points from which to climb again if `top` is no maximum, or None; and why it is none, else "".
 
-        A maximum has neither points nor a reason. Along each number at the end of its domain the likelihood is looked
-        at on
-        the way back inside; at a saddle climbs begin to both sides of it.
+        A maximum has neither points nor a reason. Of each number at the end of its domain the likelihood is looked at
+        on the way back inside. At a saddle climbs begin to both sides of it.
         """
         for index in np.flatnonzero(top.ends):
             points, rise = self._look_inwards(top, int(index))
@@ -246,8 +244,14 @@ def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
     """
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])
-    reason = "" if converged else _explain_end(remaining)
-    return HighestPoint(climbed.x[lane].copy(), ends, float(climbed.total[lane]), converged, reason, climbed.steps)
+    return HighestPoint(
+        x=climbed.x[lane].copy(),
+        ends=ends,
+        total=float(climbed.total[lane]),
+        converged=converged,
+        reason="" if converged else _explain_end(remaining),
+        steps=climbed.steps,
+    )
 
 
 def _explain_end(remaining: float) -> str:

@@ -182,17 +182,17 @@ def independent_paths(
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
-    # Hops (sensors, hops of each).
-    shape = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
-    hop_kappa = _check_hops("kappa of paths", kappa, shape, least=1.0)
-    hop_alpha = _check_hops("alpha of paths", alpha, shape, least=0.0)
+    # kappa and alpha of all hops (sensors, hops of each); one of alpha without a second axis.
+    sensors, hops_each = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
+    hop_kappa = _check_hops("kappa of paths", kappa, (sensors, hops_each), least=1.0)
+    hop_alpha = _check_hops("alpha of paths", alpha, (sensors, hops_each), least=0.0)
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
     start = None
     if error.horizon is not None:
         if initial_covariance is None:
             raise fail("paths over a horizon", "initial_covariance", "none")
         start = covariance("initial covariance of paths", initial_covariance, n)
-    # E y^2 of each sensor from the second moment of the state, its mean included.
+    # E (c x)^2 of each sensor from the second moment of the state, its mean included: E (x, 1)(x, 1)' without the 1.
     plant = LinearPlant(a, q, mean, np.eye(n) if start is None else start)
     seconds = [steady_moment(plant)] * steps if start is None else moments_over(plant, steps)
     signal = np.einsum("in,tnm,im->ti", c, np.array(seconds)[:, :-1, :-1], c)
@@ -201,10 +201,10 @@ def independent_paths(
         rows=np.tile(c, (steps, 1, 1)),
         second=signal + r,
         signal=signal,
-        path=np.repeat(np.arange(shape[0]), shape[1]),
+        path=np.repeat(np.arange(sensors), hops_each),
         kappa=np.tile(hop_kappa.ravel(), (steps, 1)),
         alpha=np.tile(hop_alpha.ravel(), (steps, 1)),
-        names=names("names of transmitters", transmitters, shape[0] * shape[1], "sender"),
+        names=names("names of transmitters", transmitters, sensors * hops_each, "sender"),
     )
 
 

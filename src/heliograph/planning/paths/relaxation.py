@@ -100,15 +100,15 @@ def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
 def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     """Return the split of each path's power over its free hops that is best, with the path's information and slope.
 
-    With the noise factor D = A prod_h (1 + alpha_h / p_h) of a path the information is j = 1 / (D - t); it is greatest
-    for the powers p_h(l) of one multiplier l, and then dD/dP = -l D.
+    With the noise factor D = A prod_h (1 + alpha_h / p_h) of a path its information is j = 1 / (D - t). It is greatest
+    where the powers p_h are those of one Lagrange multiplier l, by which they sum to P; then dD/dP = -l D.
 
     Args:
         whole: A (`full`), t (`signal`) and alpha of the paths.
         total: the power P of each path at each step (time, path).
     """
-    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
-    hops = (alpha > 0).sum(axis=-1)
+    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
+    hops = (alpha > 0).sum(axis=-1)  # number of a path's free hops with noise
     # The powers p_h(l), (time, path, hop), of exactly this sum.
     log_l = _find_multiplier(alpha, power)
     p = _split_at_multiplier(alpha, log_l)[0]
@@ -119,7 +119,7 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     below = whole.full - whole.signal * ratio
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
     slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
-    # Of no power: one hop begins with the slope 1 / (A alpha), several with none.
+    # Without power a path tells nothing: with one hop its slope is 1 / (A alpha), with several 0.
     slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
     return PowerSplit(
         powers=np.where(sends[..., None], p, 0.0),
