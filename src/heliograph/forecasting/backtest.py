@@ -381,7 +381,9 @@ def _forecast_from_each_row(
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         steps_ahead = k + 1 + jnp.arange(length)
-        _, (states, _, received) = jax.lax.scan(lambda s, ahead: outlook.step(s, *ahead), after, (window, steps_ahead))
+        _, (states, _, received) = jax.lax.scan(
+            lambda s, ahead: outlook.predict_step(s, *ahead), after, (window, steps_ahead)
+        )
         return after, (select(states), select(received))
 
     start = jax.tree.map(jnp.asarray, filter.init())

@@ -13,7 +13,7 @@ from heliograph.forecasting.backtest import list_filtered_places, select_measure
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.origins import origin_of
 from heliograph.forecasting.outlook import Outlook, find_output_claim, make_outlook, prediction_of
-from heliograph.forecasting.prediction import Forecast, InputsAhead
+from heliograph.forecasting.prediction import Forecast
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
@@ -93,22 +93,27 @@ def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
     arriving = received and prediction_of(received, names, filter.claim, angles.received)
-    whole = prediction_of(states, filter.states, filter.claim, angles.states)
-    given: InputsAhead = "given" if filter.inputs else "none"
-    return Forecast(np.ones(len(z), int), np.arange(float(len(z))), whole, measured, arriving, given)
+    return Forecast(
+        steps=np.ones(len(z), int),
+        time=np.arange(float(len(z))),
+        states=prediction_of(states, filter.states, filter.claim, angles.states),
+        outputs=measured,
+        received=arriving,
+        inputs="given" if filter.inputs else "none",
+    )
 
 
 def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
     """Return the moments that a filter predicts for each row of a recording from those before it, (rows, K, ...)."""
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+    def predict_and_correct(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the state after a row, and the moments that were predicted for it."""
         k, z_k, u_k = row
-        prior, moments = outlook.step(state, u_k, k)
+        prior, moments = outlook.predict_step(state, u_k, k)
         return outlook.filter.correct(prior, z_k, k)[0], moments
 
     start = jax.tree.map(jnp.asarray, outlook.filter.init())
-    return jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return jax.lax.scan(predict_and_correct, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
 
 
 _by_xla = quickly_compiled(_predict_each_row)

@@ -61,7 +61,7 @@ class Outlook(Module):
     transform: AbstractTransform
     receives: bool = eqx.field(static=True)
 
-    def mixture(self, state: PyTree) -> Moments:
+    def describe_states(self, state: PyTree) -> Moments:
         """Return the moments of the states as a mixture: the filter's own if it has one, else of one part.
 
         Covariances are zero where the filter claims nothing.
@@ -72,11 +72,12 @@ class Outlook(Module):
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))
-            return Moments(weights, parts.mean, jnp.asarray(jax.vmap(lambda x: x.covariance)(parts)))
+            covariances = jnp.asarray(jax.vmap(lambda part: part.covariance)(parts))
+            return Moments(weights=weights, means=parts.mean, covariances=covariances)
         estimate = filter.estimate(state)
         covariance = jnp.asarray(estimate.covariance)
-        known = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
-        return Moments(jnp.ones(1), jnp.asarray(estimate.mean)[None], known[None])
+        claimed = covariance if self.filter.claim != "none" else jnp.zeros_like(covariance)
+        return Moments(weights=jnp.ones(1), means=jnp.asarray(estimate.mean)[None], covariances=claimed[None])
 
     def moments(self, state: PyTree) -> Moments:
         """Return the moments of the states as they are now, as NumPy arrays."""
@@ -117,7 +118,7 @@ class Outlook(Module):
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
         return Moments(weights=states.weights, means=means, covariances=covariances)
 
-    def received(self, prior: PyTree, k: jax.Array) -> Moments | None:
+    def predict_received(self, prior: PyTree, k: jax.Array) -> Moments | None:
         """Return the moments of what would arrive at step k, by the predicted state; None where the filter cannot tell.
 
         Of z = 0 the innovation is minus what is expected, with the covariance of what arrives.
@@ -127,13 +128,13 @@ class Outlook(Module):
         _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
         return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
 
-    def step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
+    def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
-        states = self.mixture(prior)
+        states = self.describe_states(prior)
         outputs = self.predict_measured(prior, states, u, k)
         # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
-        received = outputs if isinstance(prior, Diffuse) else self.received(prior, k)
+        received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, k)
         return prior, (states, outputs, received)
 
 
@@ -142,6 +143,7 @@ def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant:
     premise = filter.premise
     plant = plant if premise is None else premise.plant
     believed = sensor if premise is None or premise.sensor is None else premise.sensor
+    # Such a filter is told the mode in z: the zeros by which `predict_received` asks what is expected would be a mode.
     flagged = isinstance(filter, ModeObservedFilter) or (isinstance(filter, SideInformationFilter) and filter.flagged)
     transform = getattr(filter, "transform", None)
     return Outlook(
@@ -156,7 +158,7 @@ def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant:
 @compile_on_call
 def _compute_moments_now(outlook: Outlook, state: PyTree) -> Moments:
     """Return the moments of the states at the row where the outlook begins."""
-    return outlook.mixture(state)
+    return outlook.describe_states(state)
 
 
 def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray) -> tuple[Moments | None, ...]:
@@ -198,12 +200,12 @@ def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) 
     From a state at `step`, under inputs `u` (steps, inputs).
     """
 
-    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+    def predict_row(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Return the state a row ahead, and the moments there."""
-        return outlook.step(state, *row)
+        return outlook.predict_step(state, *row)
 
     rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)[1]
+    return jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)[1]
 
 
 def _look_ahead_of_each(outlook: Outlook, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
@@ -231,7 +233,15 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
     wrapped = wrap_angles(mean, angles)
     whole_turns = (wrapped - mean)[..., None, :]
-    return Prediction(names, wrapped, covariance, claim, weights, means + whole_turns, variances)
+    return Prediction(
+        names=names,
+        mean=wrapped,
+        covariance=covariance,
+        claim=claim,
+        weights=weights,
+        part_means=means + whole_turns,
+        part_variances=variances,
+    )
 
 
 def find_output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:

@@ -186,7 +186,7 @@ class Forecast:
             part and part.map_arrays(change) for part in (self.states, self.outputs, self.received)
         )
         assert states is not None
-        return Forecast(self.steps, change(self.time, 0), states, outputs, received, self.inputs)
+        return replace(self, time=change(self.time, 0), states=states, outputs=outputs, received=received)
 
     def named(self, name: str) -> tuple[Prediction, int]:
         """Return the prediction that has a number of this name, states first, and its place there.

@@ -372,7 +372,7 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
     drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
-    points = surface.possible(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
+    points = surface.move_to_possible(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
     _check_dependence(surface, points)
     return points
 

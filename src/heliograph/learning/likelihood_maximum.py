@@ -366,7 +366,7 @@ class Solution:
         `first`: signed distances from the maximum at which the search for each end begins.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
-        return self.surface.crossings(
+        return self.surface.find_crossings(
             self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
         )
 

@@ -32,7 +32,7 @@ class Parameter:
         return size(self.domain, self.start.shape)
 
     @property
-    def entries(self) -> tuple[str, ...]:
+    def entry_names(self) -> tuple[str, ...]:
         """Return the names of its entries in the table; of a covariance those on and below the diagonal."""
         if self.start.ndim == 0:
             return (self.name,)
@@ -41,25 +41,25 @@ class Parameter:
         shown = [index for index in indices if not is_covariance or index[0] >= index[1]]
         return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in shown)
 
-    def read(self, value: Array) -> Array:
+    def list_entries(self, value: Array) -> Array:
         """Return the entries (entries,) of the table from a value of the free number."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
-    def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
+    def entries_at(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
         """Return the entries (entries,) of the table at a point x (size,) of the line."""
         with jax.enable_x64(True):
-            return np.asarray(self._read_at(np.asarray(x)))
+            return np.asarray(self._trace_entries(np.asarray(x)))
 
-    def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
+    def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
         """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
         if self.domain.kind == "interval":
             return np.diag(unlink_slope(self.domain, x))
         with jax.enable_x64(True):
-            return np.asarray(jax.jacfwd(self._read_at)(jnp.asarray(x)))
+            return np.asarray(jax.jacfwd(self._trace_entries)(jnp.asarray(x)))
 
-    def _read_at(self, x: Array) -> Array:
-        """Return the entries at coordinates, in operations that JAX traces."""
-        return self.read(map_from_line(self.domain, self.start.shape, x))
+    def _trace_entries(self, x: Array) -> Array:
+        """Return the entries (entries,) at coordinates x (size,), in operations that JAX can trace."""
+        return self.list_entries(map_from_line(self.domain, self.start.shape, x))
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
@@ -107,8 +107,8 @@ class Parameters:
         """Return the numbers of the table, in order."""
         results, begin = [], 0
         for parameter in self.every:
-            has_own = parameter.domain.kind == "interval"  # each entry a coordinate
-            for i, (name, domain) in enumerate(zip(parameter.entries, parameter.entry_domains, strict=True)):
+            has_own = parameter.domain.kind == "interval"  # then each entry has a coordinate of its own
+            for i, (name, domain) in enumerate(zip(parameter.entry_names, parameter.entry_domains, strict=True)):
                 results.append(TableEntry(name, domain, begin + i if has_own else None))
             begin += parameter.size
         return tuple(results)
@@ -117,7 +117,7 @@ class Parameters:
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of all coordinates."""
         return tuple(
-            parameter.entries[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
+            parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
             for parameter in self.every
             for i in range(parameter.size)
         )
@@ -137,13 +137,14 @@ class Parameters:
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Return the values of all entries of the table (entries,) at a point x (p,) of the line."""
-        return np.concatenate([parameter.values(single) for parameter, single in self._parts(x)])
+        return np.concatenate([parameter.entries_at(single) for parameter, single in self._split_point(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
         """Return the derivatives of all entries of the table by the coordinates x (entries, p)."""
-        return np.asarray(block_diag(*(parameter.derivatives(single) for parameter, single in self._parts(x))))
+        blocks = [parameter.differentiate_entries(own) for parameter, own in self._split_point(x)]
+        return np.asarray(block_diag(*blocks))  # an entry depends on the coordinates of its own number alone
 
-    def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
+    def _split_point(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
         """Return each free number with its own coordinates (size,) at a point x (p,)."""
         ends = np.cumsum([parameter.size for parameter in self.every])
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))

@@ -20,11 +20,11 @@ from heliograph.planning.network_of_design import add_best_filter
 from heliograph.planning.plant_moments import (
     check_constant_noise,
     check_design_plant,
-    measurement_moment,
-    steady_moment,
+    measured_moment_with_one,
+    steady_moment_with_one,
 )
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.summed_links import ALIKE, HALVINGS, SummedLinks, Vector, solve_closed_form
+from heliograph.planning.summed_links import ALIKE, HALVINGS, SummedLinks, Vector, find_amplitudes_by_formula
 from heliograph.planning.transmitters import (
     amplify_transmitter,
     compute_sent_powers,
@@ -102,9 +102,9 @@ class SumTask(NamedTuple):
         information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
         return self.error(self.covariance(information))
 
-    def solve_closed_form(self, total: float) -> Vector | None:
+    def find_amplitudes_by_formula(self, total: float) -> Vector | None:
         """Return the best amplitudes by a formula, None where there is none: it needs one signal and all links free."""
-        return solve_closed_form(self.links, total, self.caps) if np.all(self.free) else None
+        return find_amplitudes_by_formula(self.links, total, self.caps) if np.all(self.free) else None
 
     def search_amplitudes(self, total: float, starts: int, first: Vector | None = None) -> Vector:
         """Return the amplitudes (links,) of the least error that descents find from `first` and from drawn starts.
@@ -164,7 +164,7 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     if error.steps > 1:
         raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
     plant, process = check_constant_noise(check_design_plant(network.plant))
-    measured = np.asarray(measurement_moment(node.sensor, steady_moment(plant)))  # E (y, 1)(y, 1)'
+    measured = np.asarray(measured_moment_with_one(node.sensor, steady_moment_with_one(plant)))  # E (y, 1)(y, 1)'
     links, unit_channel = find_links_of_sum(node, measured)
     names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
     task = _make_task(problem, plant, process, links, names)
@@ -219,7 +219,7 @@ def _make_task(
 
 def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, Certificate]:
     """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
-    solution = task.solve_closed_form(total)
+    solution = task.find_amplitudes_by_formula(total)
     if solution is not None:
         error = task.compute_error(solution)
         return solution, Certificate(convex=True, value=error, bound=error, stationarity=0.0, starts=1, unit="error")
@@ -257,7 +257,7 @@ def _try_power(task: SumTask, power: float, near: Vector) -> Vector:
     """Return the best amplitudes at a power of the free links: by formula, else by one descent from `near`."""
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
-    solution = task.solve_closed_form(power)
+    solution = task.find_amplitudes_by_formula(power)
     return task.search_amplitudes(power, 1, near) if solution is None else solution
 
 

@@ -119,14 +119,14 @@ class Criterion(NamedTuple):
         """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
         if self.sharpness is None:
             return self.smooth(p)[0]
-        root = _root(self.weight)
+        root = _find_root(self.weight)
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def supporting(self, p: Matrices) -> "Criterion":
         """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
-        weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_root(self.weight))
+        weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_find_root(self.weight))
         size = np.trace(root @ weights @ root, axis1=1, axis2=2)
         return self._replace(weight=weights / size[:, None, None], sharpness=None)
 
@@ -139,7 +139,7 @@ class Criterion(NamedTuple):
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
-        root = _root(self.weight)
+        root = _find_root(self.weight)
         values, vectors = np.linalg.eigh(root @ p @ root)
         relative = np.maximum(values / values[:, -1:], 0.0)
         total = (relative**self.sharpness).sum(axis=1)
@@ -148,7 +148,7 @@ class Criterion(NamedTuple):
         return values[:, -1] * total ** (1 / self.sharpness), (turned * share[:, None]) @ np.swapaxes(turned, 1, 2)
 
 
-def _root(weight: Matrices) -> Matrices:
+def _find_root(weight: Matrices) -> Matrices:
     """Return the symmetric root W^1/2 of each matrix W (time, n, n)."""
     values, vectors = np.linalg.eigh(weight)
     scale = np.sqrt(np.maximum(values, 0.0))

@@ -14,7 +14,7 @@ from heliograph.planning.numbers.design import design_numbers
 from heliograph.planning.paths.design import design_paths, make_power_task
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.paths.networks import paths_of
-from heliograph.planning.plant_moments import measurement_moment, steady_moment
+from heliograph.planning.plant_moments import measured_moment_with_one, steady_moment_with_one
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
@@ -162,7 +162,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     slots, n = len(relays.slots), len(relays.states)
     receiver_gains = {RECEIVER: np.zeros((slots, n, relays.received[-1]))}
     powers = periodic_given_design(relays, gains | receiver_gains).power
-    measured = measurement_moment(relays.sensor, steady_moment(relays.plant))  # E (y, 1)(y, 1)'
+    measured = measured_moment_with_one(relays.sensor, steady_moment_with_one(relays.plant))  # E (y, 1)(y, 1)'
     sensor_sends = [any(SENSOR in links for links in slot.values()) for slot in relays.slots]
     # One descent of a problem that is not convex: no bound is known, and no tangent of the error is computed.
     certificate = Certificate(

@@ -16,7 +16,7 @@ from heliograph.numerics.module import are_same
 from heliograph.numerics.types import Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.paths.model import require_at_least
-from heliograph.planning.plant_moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.plant_moments import measured_moment_with_one, moments_with_one_over, steady_moment_with_one
 from heliograph.planning.transmitters import set_transmitter_powers, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
@@ -51,13 +51,16 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     powers = _check_powers(powers, nodes, error.steps)
     # E (x, 1)(x, 1)' of the state at each step, from which E (y, 1)(y, 1)' of what is sent follows.
-    seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
+    if error.horizon is None:
+        seconds = [steady_moment_with_one(plant)] * error.period
+    else:
+        seconds = moments_with_one_over(plant, error.horizon)
     # Each node's channel with these powers at each step.
     channels = {}
     for name, node in nodes.items():
         by_step: list[AbstractRandomAffine] = []
         for k, second in enumerate(seconds):
-            measured = measurement_moment(node.sensor, second, k)  # E (y, 1)(y, 1)'
+            measured = measured_moment_with_one(node.sensor, second, k)  # E (y, 1)(y, 1)'
             powers_of_node = _select_node(name, powers, k)
             by_step.append(set_transmitter_powers(at(node.channel, k), measured, powers_of_node, k))
         channels[name] = _make_over_time(by_step)

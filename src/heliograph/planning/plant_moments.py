@@ -78,7 +78,7 @@ def check_design_plant(plant: AnyPlant) -> LinearPlant:
     return start
 
 
-def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
+def steady_moment_with_one(plant: AnyPlant) -> Float[Array, "n1 n1"]:
     """Return the second moment E (x, 1)(x, 1)' in the steady state of a plant without inputs.
 
     Raises:
@@ -93,7 +93,9 @@ def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
     return _make_second_moment(mean, spread)
 
 
-def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None) -> list[Float[Array, "n1 n1"]]:
+def moments_with_one_over(
+    plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None
+) -> list[Float[Array, "n1 n1"]]:
     """Return E (x, 1)(x, 1)' at each step from the plant's initial law on, the first after x_0 has moved once.
 
     Args:
@@ -128,7 +130,7 @@ def _read_noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Arr
         return np.asarray(plant.noise_mean()), np.asarray(plant.noise_covariance(jnp.asarray(u)))
 
 
-def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
+def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
     """Return the second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
     now = at(sensor, step)
     c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance

@@ -18,7 +18,7 @@ from heliograph.numerics.keys import seed_key
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.planning.plant_moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.plant_moments import measured_moment_with_one, moments_with_one_over, steady_moment_with_one
 from heliograph.planning.transmitters import compute_sent_powers, compute_steady_powers
 from heliograph.relays.design import given_design
 from heliograph.simulation.network import Network
@@ -140,9 +140,9 @@ def _compute_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> dict[str, Moments]:
     """Return E (y, 1)(y, 1)' of each sensor's output at each step, in one batch, of a linear plant and sensors."""
-    seconds = [steady_moment(plant)] if horizon is None else moments_over(plant, len(inputs), inputs)
+    seconds = [steady_moment_with_one(plant)] if horizon is None else moments_with_one_over(plant, len(inputs), inputs)
     return {
-        name: np.array([[measurement_moment(sensor, x, k) for k, x in enumerate(seconds)]])
+        name: np.array([[measured_moment_with_one(sensor, x, k) for k, x in enumerate(seconds)]])
         for name, (sensor, _) in sources.items()
     }
 
@@ -230,8 +230,8 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
     # The sensor (the first column of the slots) sends y where it transmits, of the power E y'y: the trace of E y y',
     # which E (y, 1)(y, 1)' holds without its last row and column.
-    seconds = moments_over(relays.plant, steps)
-    measured = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(seconds)])
+    seconds = moments_with_one_over(relays.plant, steps)
+    measured = np.array([measured_moment_with_one(relays.sensor, x, k) for k, x in enumerate(seconds)])
     sensor_power = np.trace(measured[:, :-1, :-1], axis1=1, axis2=2) * moved.transmits_in_slot[:, 0]
     return {SENSOR: sensor_power, **given_design(relays, gains).power}
 

@@ -45,7 +45,7 @@ class SummedLinks(NamedTuple):
         return bound
 
 
-def solve_closed_form(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
+def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -> Vector | None:
     """Return the best amplitudes (links,) of one scalar signal by formulas; None where no formula is known.
 
     The sum of links with amplitudes a carries the information j = (b' a)^2 / (a' D a + N). Here b are the gains, D is

@@ -45,7 +45,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
     if channel.remembers:
         if not memories(channel):
             return 0.0
-        modes = joint_modes(channel, order=-(-highest // 2))
+        modes = joint_modes(channel, order=-(-highest // 2))  # half of it for each draw, rounded up
         now, later = (map_of_y @ np.append(y, 1.0) for map_of_y, y in zip((first, second), points, strict=True))
         worst = _compare_draw_pairs(modes, first, second)
         return max(worst, _compare_modes(modes, points, now, later, highest))
@@ -117,7 +117,10 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
     """
 
     def draw_two(words: jax.Array) -> PyTree:
-        """Return state, state after a draw, that draw, the same of a second draw, and what `sample` draws first."""
+        """Return the state at the start, then state and draw after one draw and after a second, then `sample`'s draw.
+
+        `sample` draws by the key of the first draw; () of a map that remembers, which has no such function.
+        """
         key = jax.random.wrap_key_data(words)
         start = channel.init(jax.random.fold_in(key, 2))
         after_first, h_1 = channel.draw(start, key)
@@ -159,12 +162,13 @@ def _compare_means(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray
     Raises:
         AssertionError: a difference that is more than chance.
     """
-    error = seen.std(axis=0) / np.sqrt(len(seen))
+    standard_error = seen.std(axis=0) / np.sqrt(len(seen))
     difference = np.abs(seen.mean(axis=0) - expected)
     scale = np.abs(seen).max(axis=0) + np.abs(expected)
-    certain = error <= 1e-12 * scale  # the monomial does not vary: moments must agree to rounding
+    certain = standard_error <= 1e-12 * scale  # the number does not vary: moments must agree to rounding
     assert np.all(difference[certain] <= 1e-9 * scale[certain]), f"{what}: a known moment differs"
-    ratios = difference[~certain] / error[~certain]
+    ratios = difference[~certain] / standard_error[~certain]
+    # Two-sided, with the probability of a false alarm shared by all numbers.
     limit = float(scipy.stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
     largest = float(ratios.max(initial=0.0))
     assert largest <= limit, f"{what}: a moment differs from the samples by {largest:.1f} standard errors"

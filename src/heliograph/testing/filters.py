@@ -15,6 +15,7 @@ from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.likelihood import log_likelihood
 
 ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
+MISSING = 0.3  # share of the components that do not arrive
 
 
 def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
@@ -38,14 +39,14 @@ def check_filter(filter: AbstractFilter, inputs: ArrayLike = (), steps: int = 5,
     _check_sizes(filter, inputs)
     # Measurements: the first complete, then some components missing, the last with all missing.
     data = np.random.default_rng(seed).normal(size=(steps, filter.received))
-    data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < 0.3] = np.nan
+    data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < MISSING] = np.nan
     data[-1] = np.nan
     u = np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(filter.inputs)))
     state, total = filter.init(), 0.0
     for k, z in enumerate(data):
         state, log_density = _check_step(filter, state, z, u[k], k)
         total += log_density
-    # log p(z_1, ..., z_N) = sum of the innovations' log-likelihoods.
+    # log p(z_1, ..., z_N) = sum of the innovations' log-likelihoods; both are NaN where no covariance is claimed.
     whole = float(log_likelihood(filter, data, u))
     is_sum = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
     assert is_sum, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
@@ -121,7 +122,8 @@ def _check_sizes(filter: AbstractFilter, inputs: ArrayLike) -> None:
     assert filter.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {filter.claim!r}"
     assert filter.states and len(set(filter.states)) == len(filter.states), "states: expected distinct names"
     assert filter.received >= 0, "received: expected a length"
-    # Calls with wrong sizes or infinite values, each with the name that the error must begin with.
+    # Calls with wrong sizes, a step before the first, or infinite values; each with the name of the argument with which
+    # the error has to begin.
     state, fitting = filter.init(), np.zeros(filter.received)
     wrong: list[tuple[str, Callable[[], object]]] = [
         ("inputs", lambda: filter.predict(state, np.zeros(len(filter.inputs) + 1))),

@@ -122,8 +122,9 @@ def _compare_runs(
 ) -> float:
     """Run the network in other units; return the largest difference of an estimate, as a share of what is allowed.
 
-    Estimates on the way to which a trace is minimised, a sum of squares of different units, end elsewhere in other
-    units by definition: they are compared, to SEARCHED, only where all states have one factor; all others to DIGITS.
+    Some estimates come from a search that minimises a trace, a sum of squares of different units. By definition these
+    end elsewhere in other units: they are compared, to SEARCHED, only where all states have one factor. All others are
+    compared to DIGITS.
 
     Args:
         network: the network.
@@ -144,12 +145,13 @@ def _compare_runs(
     worst = 0.0
     for node, filters in plain.items():
         for name, estimate in filters.items():
-            searches = _has_search_in_estimate(network, node, name)
-            if searches and not one_factor:
+            is_searched = _has_search_in_estimate(network, node, name)
+            if is_searched and not one_factor:
                 continue
-            allowed = SEARCHED if searches else DIGITS
+            allowed = SEARCHED if is_searched else DIGITS
             difference = _find_difference(estimate, estimates[node][name], units[node].states) / allowed
-            # What a nominal filter makes of a row that it holds for impossible is left to rounding, from there on.
+            # A nominal filter may hold a row for impossible. What it makes of that one and later ones is left to
+            # rounding, so that only the rows before are compared.
             if np.any(difference > 1) and estimate.claim == "nominal":
                 difference = difference[: _count_possible_rows(network, node, name, z, u)]
             worst = max(worst, _check_differences(f"{node}/{name}", difference))

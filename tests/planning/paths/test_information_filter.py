@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from heliograph.planning import Error
-from heliograph.planning.paths.model import PlantSteps, RiccatiMap, adjoint, compute_covariances, solve_fixed_point
+from heliograph.planning.paths.model import (
+    PlantSteps,
+    RiccatiMap,
+    compute_adjoint,
+    compute_covariances,
+    solve_fixed_point,
+)
 from heliograph.planning.paths.networks import paths_of
 from tests.planning.published import A, Q, path_problem, two_hops
 
@@ -45,7 +51,7 @@ def test_the_adjoint_is_the_gradient(start):
     a, q, j = random_steps(4, 3)
     plants, weights = PlantSteps(a, q, start), random_steps(4, 5)[2]
     p = compute_covariances(plants, j)
-    gradient = -p @ adjoint(plants, j, p, weights) @ p
+    gradient = -p @ compute_adjoint(plants, j, p, weights) @ p
     way = random_steps(4, 9)[1]  # a direction of informations
     cost = lambda s: np.sum(weights * compute_covariances(plants, j + s * way))  # noqa: E731
     h = 1e-4

@@ -170,7 +170,7 @@ def _differentiate_errors(
     """
 
     def errors_at(x: Array) -> tuple[jax.Array, jax.Array]:
-        return objective.innovations(x, z, u) if truth is None else objective.errors(x, z, u, truth)
+        return objective.compute_innovations(x, z, u) if truth is None else objective.compute_errors(x, z, u, truth)
 
     def differentiate_along(axis: jax.Array) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
         return jax.jvp(errors_at, (x,), (axis,))

@@ -135,7 +135,7 @@ class MaximumSearch:
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
         points = centre + drawn * spread
         points[count + np.arange(len(with_ends)), with_ends] -= LOWERED
-        return (self.surface.of_first_rows() or self.surface).possible(points, top.x)
+        return (self.surface.of_first_rows() or self.surface).move_to_possible(points, top.x)
 
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> Maximum:
         """Return the ends of climbs as `_climb` does; in a long recording its first rows lead them most of the way.
@@ -160,7 +160,7 @@ class MaximumSearch:
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
-        climbed = self._climb(self.surface.possible(x[lanes], starts[own]), ends)
+        climbed = self._climb(self.surface.move_to_possible(x[lanes], starts[own]), ends)
         by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}
         return Maximum(**by_start)
 
@@ -208,7 +208,7 @@ class MaximumSearch:
             points, rise = self._look_inwards(top, int(index))
             if rise.max() > SAME:
                 return points[[int(rise.argmax())]], ""
-        curvature = self.surface.curvature(top.x, top.active)
+        curvature = self.surface.measure_curvature(top.x, top.active)
         if curvature.least < SADDLE:
             return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""
         if not curvature.gain < NEAR:

@@ -94,7 +94,7 @@ class Objective:
         """Return the filter of this form at a point x (p,) of the line."""
         return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
 
-    def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
+    def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
         Of the filter at x (p,), with measurements z (steps, received) and inputs u (steps, inputs). Where the estimate
@@ -112,7 +112,7 @@ class Objective:
         innovations: tuple[jax.Array, jax.Array] = filter.scan(z, u, judged)
         return innovations
 
-    def errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
+    def compute_errors(self, x: Array, z: Array, u: Array, truth: Array) -> tuple[jax.Array, jax.Array]:
         """Return the estimates' errors (steps, n), NaN where no truth is known, and the covariances they claim.
 
         Of the filter at x (p,), with measurements z (steps, received), inputs u (steps, inputs) and true states (steps,

@@ -129,7 +129,7 @@ class LikelihoodSurface:
         information: np.ndarray = np.diag(self.evaluations(x[None]).information[0])
         return np.where(information > 0, 1 / np.sqrt(np.where(information > 0, information, 1.0)), np.inf)
 
-    def possible(
+    def move_to_possible(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
         """Return the points with finite l, and others moved towards `near` (p,), where it is finite, until it is.
@@ -144,7 +144,7 @@ class LikelihoodSurface:
             points[is_impossible] = (points[is_impossible] + near) / 2
         return points
 
-    def curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
+    def measure_curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
         """Return the least curvature of -l at x, its direction, and what a step by the Hessian would gain.
 
         Among `active` coordinates (p,), along directions that the data identify, in units of standard errors.
@@ -170,7 +170,7 @@ class LikelihoodSurface:
         gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
         return Curvature(least=float(curvatures[0]), direction=direction, gain=gain)
 
-    def crossings(
+    def find_crossings(
         self,
         x: Float[np.ndarray, " p"],
         top: float,

@@ -140,7 +140,8 @@ class MarkovLosses(AbstractLossLaw):
         stretches = check_fates(fates)
         for stretch in stretches:
             past, length = _number_last_fates(fill_ends(stretch), order)
-            # Of order 1 the chain is taken given its end, so that the step to the end counts as well.
+            # Of order 1 the chain is taken given its end, so that the step to the end counts as well. A past that comes
+            # several times is counted each time.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
         spans = _measure_spans(stretches)
@@ -226,8 +227,8 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     """
     likelihood = _LikelihoodBetweenEnds(counts, spans).evaluate
     top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
-    # Variances of the logits, the diagonal of the Hessian's inverse, from differences of the gradient. What a
-    # difference over this width leaves out is 1e-8 of it, and its rounding 1e-12.
+    # Variances of the logits: the diagonal of the Hessian's inverse, by central differences of the gradient. Over this
+    # width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
     width = 1e-4
     shifts = width * np.eye(2)
     hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
@@ -278,7 +279,8 @@ def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarra
 
     The number's lowest bit is the latest fate, 1 for lost; it has as many bits as are known, `order` at most.
     """
-    number, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
+    number = np.zeros(len(fate), dtype=int)
+    length = np.zeros(len(fate), dtype=int)  # how many of the last fates are known
     for back in range(1, order + 1):
         # The fate `back` packets ago counts where all later ones are known too.
         earlier = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]

@@ -144,17 +144,24 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     known = is_trial(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
     held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
-    laws = _fit_laws(parts, True)
+    laws = _fit_laws(parts, intervals=True)
     significant = _find_significant_laws(laws, parts)
     best = _choose_law(significant, held_out_scores)
     best_channel = _choose_law(significant - {RUNNING}, held_out_scores)
-    lost = int(np.sum(np.concatenate(parts) == 1))
-    return Losses(int(known.sum()), lost, laws, LossMemory.of(parts), held_out_scores, best, best_channel)
+    return Losses(
+        packets=int(known.sum()),
+        lost=int(np.sum(np.concatenate(parts) == 1)),
+        laws=laws,
+        memory=LossMemory.of(parts),
+        held_out=held_out_scores,
+        best=best,
+        best_channel=best_channel,
+    )
 
 
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
     """Return the names of laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them."""
-    level = LEVEL / (len(laws) - 1)
+    level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
     for name, law in laws.items():
@@ -195,7 +202,7 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
     late = known & (np.cumsum(known) > cut)
     early = np.where(late, np.nan, everything)
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
-    laws = _fit_laws(CheckedFates(np.split(early, ends)), False)
+    laws = _fit_laws(CheckedFates(np.split(early, ends)), intervals=False)
     log_likelihoods = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     scores = {}
     for name, logs in log_likelihoods.items():

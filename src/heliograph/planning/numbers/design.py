@@ -73,7 +73,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         covariance=found.covariances,
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
         price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
-        numbers=problem.numbers.named(best),
+        numbers=problem.numbers.split_by_name(best),
         realised=repeat_network(network) if task.criterion.period > 1 else network,
     )
 

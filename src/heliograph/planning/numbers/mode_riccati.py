@@ -80,7 +80,7 @@ def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
 
     X_k,i = E[e e' 1{mode i}] is the error covariance after step k, split by mode.
     """
-    # The recursion, until its gains stabilise.
+    # The recursion, until its gains stabilise the error; it begins without any error but the plant's noise.
     last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
         parts, gains = _run_riccati(m, last)

@@ -76,7 +76,7 @@ class FreeNumbers(NamedTuple):
         """Largest values of all free numbers."""
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
-    def named(self, x: Array) -> dict[str, Any]:
+    def split_by_name(self, x: Array) -> dict[str, Any]:
         """Return {name: number in its shape} from the vector x of all free numbers."""
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
@@ -196,7 +196,7 @@ class TracedNetwork:
 
     def make_system(self, x: Array) -> ModeSystem:
         """Return the system of the best linear filter where the free numbers have the values x (numbers,)."""
-        values = self.numbers.named(jnp.asarray(x))
+        values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
         try:
             network = self.build(**values)
@@ -218,7 +218,7 @@ class TracedNetwork:
 
 
 @lru_cache(PROGRAMS)
-def programs(
+def compile_programs(
     network: TracedNetwork,
 ) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
     """Return the compiled programs of a network's system and derivatives; equal networks share them."""
@@ -260,12 +260,12 @@ class NumberProblem:
         if not all(means_are_known(name, first(source.channel)) for name, source in sources):
             self.young, self.numbers = True, FreeNumbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
         self.names, self.criterion = list_transmitters(network), error.criterion(network.states)
-        self._system, self._slopes = programs(TracedNetwork(build, self.numbers, error, self.young, network))
+        self._system, self._slopes = compile_programs(TracedNetwork(build, self.numbers, error, self.young, network))
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
         """Return the network at these numbers."""
-        named = self.numbers.named(x).items()
+        named = self.numbers.split_by_name(x).items()
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
@@ -299,7 +299,7 @@ class NumberProblem:
             system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
             if system.start is None:
                 # With Young's scalar b the system holds sqrt(1 + b) A; the plant itself has to be stable.
-                scale = np.sqrt(1 + np.ravel(self.numbers.named(x)[YOUNG])[0]) if self.young else 1.0
+                scale = np.sqrt(1 + np.ravel(self.numbers.split_by_name(x)[YOUNG])[0]) if self.young else 1.0
                 check_stable(system.transition[0] / scale)
             solution = solve_riccati(system, criterion)
             slopes = ErrorAndPowerSlopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))

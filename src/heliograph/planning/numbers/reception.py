@@ -24,7 +24,12 @@ from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.numbers.mode_riccati import ModeSystem
-from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.plant_moments import (
+    check_design_plant,
+    measured_moment_with_one,
+    moments_with_one_over,
+    steady_moment_with_one,
+)
 from heliograph.planning.transmitters import compute_powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import find_stationary_law
@@ -141,7 +146,7 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
     # What each node receives, from the second moments E (x, 1)(x, 1)' of the state. They are steady where the steps
     # repeat for ever.
-    seconds = [steady_moment(plants[0])] * steps if forever else moments_over(network.plant, steps)
+    seconds = [steady_moment_with_one(plants[0])] * steps if forever else moments_with_one_over(network.plant, steps)
     states = jnp.stack([jnp.asarray(second) for second in seconds])
     b = None if young is None else jnp.broadcast_to(young, (steps,))
     nodes = [describe_reception(name, source, states, forever, b) for name, source in list_sources(network).items()]
@@ -312,7 +317,7 @@ def _describe_steps(
         law: of the modes at each step (time, M).
     """
     # H and N of each mode, from E (y, 1)(y, 1)' of what the sensor measures at each step.
-    y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
+    y = jax.vmap(lambda second: measured_moment_with_one(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
     described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     outputs = [jnp.tile(h, (len(y), 1, 1)) for h, _ in described]  # H of a mode is the same at each step

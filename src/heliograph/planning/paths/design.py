@@ -75,7 +75,7 @@ class PathProblem(NamedTuple):
         value, _, gradient = sharp.sensitivity(powers)
         return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
 
-    def support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
+    def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
         """Return the problem whose error, linear in P, touches this one's from below at p, its value and gradient.
 
         The gradient is by the powers p (time, free).
@@ -89,7 +89,7 @@ class PathProblem(NamedTuple):
 
         It is f(p) + min over allowed q of grad f(p).(q - p).
         """
-        _, value, gradient = self.support(powers)
+        _, value, gradient = self.make_support(powers)
         return float(value + np.sum(gradient * (self.limits.find_best_powers(-gradient) - powers)))
 
     def bound_least_total(self, powers: Powers, target: float) -> float:
@@ -97,7 +97,7 @@ class PathProblem(NamedTuple):
 
         By bisection of the total power.
         """
-        _, value, gradient = self.support(powers)
+        _, value, gradient = self.make_support(powers)
         low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
             middle = (low + high) / 2
@@ -270,7 +270,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     assert powers is not None  # the starts are within the limits
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
     value, bound = problem.exact(powers), problem.lower_bound(powers)
-    _, tangent_value, _ = problem.support(powers)
+    _, tangent_value, _ = problem.make_support(powers)
     stationarity = max(tangent_value - bound, 0.0) / value
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
@@ -287,7 +287,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     )
 
 
-def least_power(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
+def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
     """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
     _check_reachable(task, target)
     # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
@@ -373,7 +373,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
         target: the target error; None for the least error.
         present: error of the network as it is.
     """
-    powers, certificate = find_least_error_powers(task) if target is None else least_power(task, target)
+    powers, certificate = find_least_error_powers(task) if target is None else find_least_total_powers(task, target)
     paths = task.problem.paths
     of_all_hops = task.fixed.copy()
     of_all_hops[:, task.free] = powers

@@ -24,7 +24,7 @@ from heliograph.numerics.check import array, covariance, fail, instance, names, 
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error_objective import Error
-from heliograph.planning.plant_moments import moments_over, steady_moment
+from heliograph.planning.plant_moments import moments_with_one_over, steady_moment_with_one
 
 DOUBLINGS = 60
 CONVERGED = 1e-16  # relative change of the fixed point by a doubling: rounding
@@ -48,7 +48,7 @@ class RiccatiMap(NamedTuple):
     h: Float[np.ndarray, "n n"]
 
 
-def compose(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
+def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
     """Return the map of two steps of the filter, the first applied first: again a map A X (I + G X)^-1 A' + H."""
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
@@ -65,7 +65,7 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(DOUBLINGS):
-            twice = compose(step, step)
+            twice = compose_steps(step, step)
             if not np.all(np.isfinite(twice.h)):
                 break
             if np.abs(twice.h - step.h).max() <= CONVERGED * np.abs(twice.h).max():
@@ -85,7 +85,7 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     # takes in step k - 1's information and moves to step k.
     if plants.start is None:
         steps = [RiccatiMap(a[k], information[k - 1], q[k]) for k in (*range(1, len(a)), 0)]
-        predicted = solve_fixed_point(reduce(compose, steps))
+        predicted = solve_fixed_point(reduce(compose_steps, steps))
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps, on roots.
@@ -98,7 +98,7 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     return np.array(posteriors)
 
 
-def adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
+def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Return the adjoint L_k (time, n, n), the gradient of the cost with respect to P_k through all later steps.
 
     `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
@@ -194,7 +194,7 @@ def independent_paths(
         start = covariance("initial covariance of paths", initial_covariance, n)
     # E (c x)^2 of each sensor from the second moment of the state, its mean included: E (x, 1)(x, 1)' without the 1.
     plant = LinearPlant(a, q, mean, np.eye(n) if start is None else start)
-    seconds = [steady_moment(plant)] * steps if start is None else moments_over(plant, steps)
+    seconds = [steady_moment_with_one(plant)] * steps if start is None else moments_with_one_over(plant, steps)
     signal = np.einsum("in,tnm,im->ti", c, np.array(seconds)[:, :-1, :-1], c)
     return Paths(
         plants=PlantSteps(np.tile(a, (steps, 1, 1)), np.tile(q, (steps, 1, 1)), start),
@@ -299,6 +299,6 @@ def compute_path_sensitivities(
         p: the error covariance P after each step.
         weights: derivative of the cost by P of each step.
     """
-    ahead = adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
+    ahead = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
     projected = paths.rows @ p
     return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))

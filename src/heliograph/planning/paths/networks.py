@@ -11,7 +11,12 @@ from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.paths.model import Paths, PlantSteps
-from heliograph.planning.plant_moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.plant_moments import (
+    check_design_plant,
+    measured_moment_with_one,
+    moments_with_one_over,
+    steady_moment_with_one,
+)
 from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
@@ -57,10 +62,10 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     if error.horizon is None:
         if covered is not None:
             raise fail("steady error", "a network that does not vary (give a horizon)", "parts that are OverTime")
-        seconds, start = [steady_moment(plant)] * steps, None
+        seconds, start = [steady_moment_with_one(plant)] * steps, None
     else:
         check_horizon(steps, covered)
-        seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
+        seconds, start = moments_with_one_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's A and Q.
     described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
@@ -231,7 +236,7 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
         # Chains of the channel, and what their transmitters send at present, by E (y, 1)(y, 1)' of the outputs.
-        measured, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
+        measured, noise = np.asarray(measured_moment_with_one(sensor, state)), np.asarray(sensor.noise.covariance)
         chains = find_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
