@@ -39,7 +39,7 @@ def compare_quantiles(e: np.ndarray) -> Quantiles:
     n = len(came)
     place = np.arange(1, n + 1)
     low, high = (np.asarray(ndtri(beta.ppf(p, place, n + 1 - place))) for p in (OUTSIDE, 1 - OUTSIDE))
-    return Quantiles(ndtri(place / (n + 1)), came, low, high)
+    return Quantiles(normal=ndtri(place / (n + 1)), residuals=came, low=low, high=high)
 
 
 def draw_residuals(

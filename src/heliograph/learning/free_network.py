@@ -71,13 +71,13 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
     what = "free number" if name is None else name
     value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
     reader = _reader.get()
-    return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
+    return (value if value.ndim else float(value)) if reader is None else reader.answer_free(value, name, kind)
 
 
 class _FreeNumberReader(Protocol):
     """What answers the calls of `free` while a network is built."""
 
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return what stands in the place of the free number."""
 
 
@@ -122,7 +122,7 @@ class FreeNumberCollector:
     def __init__(self) -> None:
         self.marks: list[_MarkedNumber] = []
 
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the start, marked so that checks of its place report the domain."""
         for mark in self.marks:
             if name is not None and mark.given == name:
@@ -154,7 +154,7 @@ class ValueReader:
         self.values = values
         self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value of this name, or of the next number without a name."""
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:

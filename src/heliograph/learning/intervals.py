@@ -43,15 +43,15 @@ def count_cosines(steps: int) -> int:
 def find_numbers_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Return which of k numbers have their information in a few of the nu stretches of the data, (k,).
 
-    `information`: of each recording that of each row on each number (steps, k). (sum_b V_b)^2 / sum_b V_b^2, of V_b in
-    stretch b, is the number of stretches if all tell the same, and 1 if one tells all. Scores vary over time only where
-    they are told of: cosines that hardly change there see next to nothing.
+    `information`: of each recording that of each row on each number (steps, k). With the information V_b of stretch b,
+    (sum_b V_b)^2 / sum_b V_b^2 is the number of stretches if all tell the same, and 1 if one tells all. The scores of
+    such numbers vary within a few stretches alone, in which cosines hardly change: they see next to nothing of it.
     """
     by_recording = []
     for rows in information:
         count = count_cosines(len(rows))
         begins = np.arange(count) * len(rows) // count
-        by_recording.append(np.add.reduceat(rows, begins, axis=0))
+        by_recording.append(np.add.reduceat(rows, begins, axis=0))  # sums over each stretch
     stretches = np.maximum(np.concatenate(by_recording), 0.0)  # V, (stretches, k)
     return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
 

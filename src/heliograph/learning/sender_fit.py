@@ -179,7 +179,7 @@ def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " 
             best = _Top(x.copy(), total, converged=False, stopped=True)
         return total
 
-    ends = list[_Top]()
+    ends = list[_Top]()  # of the searches
     try:
         for point in points:
             ends.append(_climb_simplex(evaluate, np.asarray(point)))

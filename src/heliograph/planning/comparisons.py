@@ -65,8 +65,10 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
     for total in powers:
         advance(f"the best for a power of {total:.4g}")
         designs.append(design(problem.replace_total(float(total))))
+    # A design that was found for less power counts for more power too: the least error so far.
     errors = np.minimum.accumulate([best.error for best in designs])
-    return Front(powers, errors, np.minimum([best.bound for best in designs], errors))
+    bounds = np.minimum([best.bound for best in designs], errors)
+    return Front(totals=powers, errors=errors, bounds=bounds)
 
 
 def totals_about(total: float) -> list[float]:
@@ -125,7 +127,7 @@ def error_over_sites(
             if not isinstance(network, Network):
                 raise fail("map", "a function of x and y that returns a Network", type(network).__name__)
             errors[row, column] = design(replace(problem, network=network)).error
-    return SiteMap(columns, rows, errors)
+    return SiteMap(x=columns, y=rows, errors=errors)
 
 
 @readable
@@ -168,7 +170,7 @@ def worth_of_changes(
     for name, changed in _list_changes(problem, network, exponent).items():
         advance(name)
         value = design(changed).certificate.value
-        worths.append(ChangeWorth(name, value, best.certificate.value - value))
+        worths.append(ChangeWorth(name=name, value=value, saved=best.certificate.value - value))
     return sorted(worths, key=lambda change: -change.saved)
 
 

@@ -90,10 +90,11 @@ class Error(Module):
         return np.asarray(matrix)
 
     def criterion(self, states: tuple[str, ...]) -> "Criterion":
-        """Return the number for a plant with these states, as a function of covariances."""
+        """Return the number that is to be small for a plant with these states, as a function of covariances."""
+        # The last step alone counts, or all alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
-        return Criterion(weight, shares, SHARPER[-1] if self.worst else None)
+        return Criterion(weight=weight, shares=shares, sharpness=SHARPER[-1] if self.worst else None)
 
 
 class Criterion(NamedTuple):

@@ -128,11 +128,9 @@ class Programme:
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
         """Return the point where a sequential quadratic programme ends, or the start where that is better."""
-        constraints = (
-            [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
-            if len(self.limit_room(z))
-            else []
-        )
+        constraints = []
+        if len(self.limit_room(z)):
+            constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
         before = self.merit(z)
         end = self._minimize(self.objective, z, constraints, tolerance)
         # Neither the start nor the end is within the limits: first back into them, then down again.
@@ -195,7 +193,7 @@ class Programme:
         slopes A of the active limits' room, and H the Hessian of the Lagrangian value - m' room. None where all
         variables are at bounds, or derivatives are not finite.
         """
-        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))
+        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))  # variables at no bound
         room = self.limit_room(z)
         active = room <= ACTIVE
         if not len(index):
@@ -204,10 +202,10 @@ class Programme:
         scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
         slopes = self.limit_room_slope(z)[active][:, index] * scale
         gradient = self.objective(z)[1][index] * scale
-        # Multipliers that leave least of the gradient, then the Hessian of the Lagrangian with these.
+        # The multipliers with which A' m comes nearest to the gradient, and the Hessian of the Lagrangian with these.
         multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
         hessian = self._differentiate_lagrangian(z, multipliers, active, index, scale)
-        # The equations of Karush, Kuhn and Tucker on the active limits.
+        # The equations of Karush, Kuhn and Tucker on the active limits, with H made symmetric.
         system = np.block([[(hessian + hessian.T) / 2, -slopes.T], [slopes, np.zeros((len(slopes), len(slopes)))]])
         right = np.concatenate([-gradient, -room[active]])
         if not np.all(np.isfinite(system)):

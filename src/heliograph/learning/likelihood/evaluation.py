@@ -95,7 +95,7 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
         by_recording.append(evaluated)
     density, score, halves = (np.stack(leaves) for leaves in zip(*by_recording, strict=True))
     # A leading axis for the one point; sums over all rows count as one row.
-    whole = Evaluation(density[None], score[None], halves.sum(axis=0)[None])
+    whole = Evaluation(density=density[None], score=score[None], halves=halves.sum(axis=0)[None])
     return whole if by_row else whole._replace(density=density[None, :, None], score=score[None, :, None])
 
 
@@ -118,7 +118,7 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
         parts = [to_numpy(_by_xla(objective, *pair)) for pair in zip(*pairs, strict=True)]
         results = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     density, score, halves = (leaf.reshape(len(x), count, *leaf.shape[1:]) for leaf in results)
-    return Evaluation(density, score, halves.sum(axis=1))
+    return Evaluation(density=density, score=score, halves=halves.sum(axis=1))
 
 
 def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth: Array | None = None) -> Evaluation:
@@ -143,7 +143,8 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
     # A linear filter with known gains has a recursion of its own for these derivatives.
     kalman = _find_kalman_filter(objective) if truth is None else None
     if kalman is not None:
-        return Evaluation(*kalman.score_rows(objective.filter, x, half).scan(z, u))
+        density, score, halves = kalman.score_rows(objective.filter, x, half).scan(z, u)
+        return Evaluation(density=density, score=score, halves=halves)
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
     def add_row(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -158,7 +159,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
 
     rows = jnp.arange(len(z)), e, s, de, ds, jnp.asarray(z if truth is None else truth)
     halves, (density, score) = jax.lax.scan(add_row, jnp.zeros((2, len(x), len(x))), rows)
-    return Evaluation(density, score, halves)
+    return Evaluation(density=density, score=score, halves=halves)
 
 
 def _differentiate_errors(

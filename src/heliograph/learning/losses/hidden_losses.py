@@ -59,7 +59,7 @@ class HiddenModeLosses(AbstractLossLaw):
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:  # the good mode is the one that loses less
             good, bad, fails, recovers = bad, good, recovers, fails
-        return HiddenModeLosses(good, bad, fails, recovers)
+        return HiddenModeLosses(good_loss=good, bad_loss=bad, fail=fails, recover=recovers)
 
     def shares(self) -> dict[str, Share]:
         """Return the losses of each mode and the chain's probabilities, with likelihood intervals."""
@@ -127,17 +127,20 @@ class FateRuns:
         return float(total[4].real), np.asarray(total[:4].imag / STEP)
 
     def _compute_log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of all stretches for several sets of shares, (sets,).
+        """Return the log-likelihood of all stretches for several sets of shares, (sets,); shares may be complex.
 
-        `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover. It
-        is log of 1' (T' A)^n ... (T' A)^m p, a product over runs, with the matrices that the class defines.
+        It is the log of 1' (T' A)^n ... (T' A)^m p, a product over runs of equal fates: the first has m packets, the
+        last n. A has the probabilities of a run's fate in each mode, T is the transition of the modes, and p their
+        stationary law.
+
+        `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover.
         """
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
-        # T', with columns from the present mode; the diagonal of A for each fate; p 1' with the stationary law p.
+        # T', with a column for each present mode; the diagonal of A for each fate; p 1', for the start of a stretch.
         transposed = _stack_matrices([[1 - fails, recovers], [fails, 1 - recovers]])
         probabilities = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
-        away = fails + recovers
+        away = fails + recovers  # probability to leave a mode, of both together
         start = _stack_matrices([[recovers / away] * 2, [fails / away] * 2])
         # (T' A)^length of each run, as a matrix and the logarithm of its scale, computed once for each length.
         matrices = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
@@ -150,7 +153,7 @@ class FateRuns:
             power, scale = _raise_matrices(step, lengths)
             matrices[:, runs], scales[:, runs] = power[:, length_of_run], scale[:, length_of_run]
         product, scale = _multiply_runs(matrices)
-        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p is their sum.
+        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p is the sum of one.
         probability = product.sum(axis=-2)[..., 0]
         return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
 

@@ -54,7 +54,7 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through
     h = second.h + second.a @ inner @ first.h @ second.a.T
-    return RiccatiMap(second.a @ through, (g + g.T) / 2, (h + h.T) / 2)
+    return RiccatiMap(a=second.a @ through, g=(g + g.T) / 2, h=(h + h.T) / 2)
 
 
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
@@ -84,14 +84,14 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     # Predicted covariance of the first step: fixed point over the period, or from the start. Each map of the period
     # takes in step k - 1's information and moves to step k.
     if plants.start is None:
-        steps = [RiccatiMap(a[k], information[k - 1], q[k]) for k in (*range(1, len(a)), 0)]
+        steps = [RiccatiMap(a=a[k], g=information[k - 1], h=q[k]) for k in (*range(1, len(a)), 0)]
         predicted = solve_fixed_point(reduce(compose_steps, steps))
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps, on roots.
     root, process, posteriors = roots_of(predicted), roots_of(q), list[np.ndarray]()
     for k, received in enumerate(information):
-        if k:
+        if k:  # the first step is predicted already
             root = np.concatenate([a[k] @ root, process[k]], axis=1)
         root = observe_information(root, received).root
         posteriors.append(covariance_of_root(root))
