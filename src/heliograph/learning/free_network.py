@@ -233,7 +233,8 @@ def describe(network: Build) -> Description:
     if not collector.marks:
         raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
     parameters = collector.parameters()
-    return Description(network, parameters, tuple(mark.given is not None for mark in collector.marks))
+    is_named = tuple(mark.given is not None for mark in collector.marks)
+    return Description(build=network, parameters=parameters, named=is_named)
 
 
 def check_network(network: object) -> Network:

@@ -100,7 +100,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     ranks = []
     for i, x in enumerate(points):
         z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
-        data = LikelihoodData(z[None], u[None], (len(z),))
+        data = LikelihoodData(measurements=z[None], inputs=u[None], lengths=(len(z),))
         ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
 
@@ -144,9 +144,9 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     """
     names = identifiability.parameters.coordinates
     lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
-    if solution is not None and any(
-        group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups
-    ):
+    # Where a group has more identified combinations than products, moments of the links say more.
+    has_others = any(group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups)
+    if solution is not None and has_others:
         lines += describe_identified_links(solution)
     if identifiability.weakest < WEAK:
         lines.append(

@@ -281,7 +281,7 @@ def _reach_target(task: SumTask, target: float) -> tuple[Vector, Certificate]:
     """
     unlimited = not np.isfinite(task.largest_total)
     total = task.largest_total
-    if unlimited:  # any power to begin with: that sent at present, or the receiver's noise
+    if unlimited:  # a power to begin doubling with: that sent at present, or the receiver's noise
         total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor)
     found, certificate = _find_least_error_amplitudes(task, total)
     for _ in range(DOUBLINGS if unlimited else 0):

@@ -139,7 +139,8 @@ def worth_of_sensors(
         z_of_case = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
         squares = _compute_squares_at_end(filter_of_all, z_of_case, u, truth, is_exact)
         errors.append(_describe_error(case.name, squares, complete=errors[0].error if errors else None))
-    return SensorWorth(network.states, complete=errors[0], cases=tuple(errors[1:]), exact=is_exact, added=tuple(added))
+    complete, *others = errors
+    return SensorWorth(network.states, complete=complete, cases=tuple(others), exact=is_exact, added=tuple(added))
 
 
 def _describe_error(
@@ -242,6 +243,7 @@ def _compute_squares_at_end(
     One run stands for all where variances are exact and the same rows arrive in all of them.
     """
     squares, used = [], filter.angles_used()
+    # What arrives decides the variances: with one pattern of NaN they are the same in all runs.
     alike = exact and np.array_equal(np.isnan(z), np.broadcast_to(np.isnan(z[:1]), z.shape))
     for row, x in zip(z, truth, strict=True):
         filtered = filter.run(row, u)

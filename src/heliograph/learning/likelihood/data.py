@@ -158,7 +158,7 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
         raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
     u = np.zeros((steps, 0))
     if inputs is not None:
-        u = np.array(check_rows("inputs", inputs, steps, count, False, network.inputs))
+        u = np.array(check_rows("inputs", inputs, steps, count, missing=False, names=network.inputs))
     check_inputs(network.inputs, u, (network.plant, network.nodes, network.fused))
     return np.concatenate(columns, axis=1), u
 

@@ -153,9 +153,10 @@ class MaximumSearch:
             return self._climb(starts, ends)
         others, x = np.arange(len(starts)) != own, starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
-        led = maximise(short.evaluate, starts[others], moving, None, self.surface.domains, joining=True)
+        led = maximise(short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True)
         x[others] = led.x
-        # Of each start the first one that is at the same point, to AT_ONE_POINT standard errors.
+        # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `lanes` are the
+        # starts that climb, and `lane_of_start` which of these stands for each.
         error = short.standard_errors(led.x[led.order[0]])
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
@@ -177,7 +178,9 @@ class MaximumSearch:
             self.watch(now)
 
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
-        return maximise(self.surface.evaluate, starts, moving, keep_best, self.surface.domains, joining=True)
+        return maximise(
+            self.surface.evaluate, starts, moving, watch=keep_best, domains=self.surface.domains, joining=True
+        )
 
     def _move_to_limits(self, top: HighestPoint) -> HighestPoint:
         """Return the point with those numbers at an end of their domain that the data hardly see, climbed anew.

@@ -52,18 +52,20 @@ class LikelihoodSurface:
         every = self.objective.description.parameters.every
         low, high = (np.concatenate(column) for column in zip(*map(_find_ends_at_infinity, every), strict=True))
         single = np.concatenate([np.full(number.size, number.domain.kind == "interval") for number in every])
-        return OpenEnds(low, high, single & (low | high))
+        return OpenEnds(low=low, high=high, single=single & (low | high))
 
     def of_first_rows(self) -> "LikelihoodSurface | None":
         """Return the likelihood of the first rows of long recordings alone; None where they are not long."""
         data = self.data
         if data.measurements.shape[1] < LONG:
             return None
-        truth = None if data.truth is None else data.truth[:, :FIRST]
-        lengths = tuple(min(length, FIRST) for length in data.lengths)
-        return LikelihoodSurface(
-            self.objective, LikelihoodData(data.measurements[:, :FIRST], data.inputs[:, :FIRST], lengths, truth)
+        first_rows = LikelihoodData(
+            measurements=data.measurements[:, :FIRST],
+            inputs=data.inputs[:, :FIRST],
+            lengths=tuple(min(length, FIRST) for length in data.lengths),
+            truth=None if data.truth is None else data.truth[:, :FIRST],
         )
+        return LikelihoodSurface(self.objective, first_rows)
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return l, scores and information at each point (points, p); the result for the last points is kept."""
@@ -92,8 +94,9 @@ class LikelihoodSurface:
         information: np.ndarray = self.evaluations(x[None]).information[0]
         # Each coordinate is moved by DIFFERENCE standard errors to either side.
         diagonal = np.diag(information)
-        width = np.where(diagonal > 0, DIFFERENCE / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
-        moving = np.flatnonzero(active & (diagonal > 0))
+        is_told = diagonal > 0
+        width = np.where(is_told, DIFFERENCE / np.sqrt(np.where(is_told, diagonal, 1.0)), 0.0)
+        moving = np.flatnonzero(active & is_told)
         if not len(moving):
             return information
         shifts = np.zeros((len(moving), len(x)))

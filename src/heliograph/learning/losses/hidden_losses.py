@@ -153,7 +153,7 @@ class FateRuns:
             power, scale = _raise_matrices(step, lengths)
             matrices[:, runs], scales[:, runs] = power[:, length_of_run], scale[:, length_of_run]
         product, scale = _multiply_runs(matrices)
-        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p is the sum of one.
+        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p sums one.
         probability = product.sum(axis=-2)[..., 0]
         return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
 
