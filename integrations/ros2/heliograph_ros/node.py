@@ -30,7 +30,7 @@ class Estimator(Node):
         path, chosen, window = (declare(n, v).value for n, v in [("network", ""), ("filter", ""), ("window", 10.0)])
         network, module = load_module(path)
         self.translator = Translator(module.get("sources"), network)
-        options = Options(window)._replace(step=self.translator.sources.step)
+        options = Options(window)._replace(step=self.translator.sources.step_seconds)
         self.service = Service(Fleet(NetworkProgram(network), options), InMemoryStore())
         names = [f"{node}/{name}" for node, item in network.nodes.items() for name in item.filters]
         self.node, _, self.filter = (chosen or names[0]).partition("/")

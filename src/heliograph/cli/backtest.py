@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from heliograph.simulation.network import Network
 
 NAME = "backtest"
+STAGES = 3  # of the progress bar: reading the network, reading the data, forecasting
+STAGES_WITH_REFIT = STAGES + 1  # fitting too
 
 
 def backtest(
@@ -51,10 +53,12 @@ def backtest(
     from heliograph.report.results import write_results
 
     # Check the options before anything is computed.
-    target, asked = choose_results_folder("backtest", out, NAME) / NAME, horizons_in(horizons)
+    target = choose_results_folder("backtest", out, NAME) / NAME
+    # One number, or a list in which spans of time and dates may stand too: a backtest takes numbers of rows only.
+    asked = horizons_in(horizons)
     listed = [asked] if isinstance(asked, int) else asked
-    ahead = [horizon for horizon in listed if isinstance(horizon, int)]
-    if len(ahead) < len(listed):
+    rows_ahead = [horizon for horizon in listed if isinstance(horizon, int)]
+    if len(rows_ahead) < len(listed):
         raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
     check_count("--refit", refit, 0)
 
@@ -69,16 +73,25 @@ def backtest(
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
         z, u, time, truth = data.recording
-        fit_to_first = _make_refit(network, data.recording, advance) if refit else None
-        return heliograph.backtest(loaded, z, ahead, u, time, truth, skip, fit_to_first, refit or 1)
+        return heliograph.backtest(
+            loaded,
+            measurements=z,
+            horizons=rows_ahead,
+            inputs=u,
+            time=time,
+            truth=truth,
+            skip=skip,
+            refit=_make_refit(network, data.recording, advance) if refit else None,
+            every=refit or 1,  # without a refit it says nothing, but has to be positive
+        )
 
-    def results(found: "heliograph.forecasting.Backtest") -> "Results":
+    def make_results(found: "heliograph.forecasting.Backtest") -> "Results":
         """Return the content of the results folder."""
         from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network, refit)
 
-    found = write_results(target, 4 if refit else 3, compute, results)
+    found = write_results(target, STAGES_WITH_REFIT if refit else STAGES, compute, make_results)
     for score in found.scores:
         shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
         print(visible(f"{score.node}/{score.filter} {score.part} {score.name}, {score.horizon} ahead: within the "
@@ -92,8 +105,8 @@ def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "
 
     build, (z, u, _, _) = NetworkAgain(reference), recording
 
-    def refit(rows: int) -> "Network":
+    def fit_to_first(rows: int) -> "Network":
         advance("fitting to the rows before", rows, len(recording.time))
         return heliograph.fit(build, {name: values[:rows] for name, values in z.items()}, u[:rows]).network
 
-    return refit
+    return fit_to_first

@@ -213,7 +213,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
     stop = asyncio.Event()
     # The reader of messages in others' form, where the network's file has sources; these then say how long a step is.
     reader = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
-    step = settings.options.step if reader is None else reader.sources.step
+    step = settings.options.step if reader is None else reader.sources.step_seconds
     fleet = Fleet(program, settings.options._replace(step=step))
     fleet.periods = {} if reader is None else reader.sources.periods
     with set_stop_on_signals(stop), contextlib.ExitStack() as owning:

@@ -155,7 +155,7 @@ def test_a_change_is_a_step_of_a_node_whose_sender_has_the_deadband():
         net = hg.Network(plant, {"boiler": hg.Node(sensor, hg.perfect(), {"f": item}, trigger=trigger)})
         field = hg.files.json_field("value", "boiler", time="source_time", step=rule.interval)
         translator = Translator({VARIABLE: field}, net)
-        fleet = Fleet(NetworkProgram(net), Options(window=20.0, step=translator.sources.step))
+        fleet = Fleet(NetworkProgram(net), Options(window=20.0, step=translator.sources.step_seconds))
         service, transport = (
             Service(fleet, InMemoryStore()),
             make_transport(parse_address(url, {}), translator=translator),

@@ -86,31 +86,33 @@ class Layout:
     def _place_field(self, begin: int, node: str, of: Any, path: str) -> int:
         """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
 
+        The bytes are those of CDR, the encoding of ROS 2: each number is aligned to its size.
+
         Args:
             begin: the byte behind the field before it.
-            node: what the field is: "NAME" of a message, "BASE" of a number or text, "ARRAY" or "SEQUENCE" of a list.
-            of: the message's type; the basic type; or what the list has, and how many of it ("SEQUENCE": at most).
+            node: what the field is, as rosbags names it: "NAME" of a message, "BASE" of a number or text, "ARRAY" or
+                "SEQUENCE" of a list of fixed or of any length.
+            of: of "NAME" the message's type; of "BASE" the basic type, first in a tuple; of a list what each of its
+                items is, as a pair like `node` and `of`, and how many there are ("SEQUENCE": at most).
             path: dotted path of the field in the whole message.
         """
-        # A part, a text, a number.
         if node == "NAME":
             return self._place_message(begin, of, f"{path}.")
-        if node == "BASE" and of[0] == "string":
+        if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
             begin = _align_to_size(begin, 4)
             return begin + 4 + self._read_length(begin)
         if node == "BASE":
             return self._place_numbers(begin, of[0], 1, [path])
-        # A list, of numbers or of anything else; before one of any length stands its length.
-        (inner_node, inner), count = of
-        if node == "SEQUENCE":
+        (item_node, item_of), count = of
+        if node == "SEQUENCE":  # the length that it has in this message stands before its items
             begin = _align_to_size(begin, 4)
             count, begin = self._read_length(begin), begin + 4
-        if inner_node.name == "BASE" and inner[0] in NUMBERS:
+        if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
-            return self._place_numbers(begin, inner[0], count, names)
+            return self._place_numbers(begin, item_of[0], count, names)
         for i in range(count):
-            begin = self._place_field(begin, inner_node.name, inner, f"{path}.{i}")
+            begin = self._place_field(begin, item_node.name, item_of, f"{path}.{i}")
         return begin
 
     def _place_numbers(self, begin: int, kind: str, count: int, names: list[str]) -> int:
@@ -244,17 +246,17 @@ def _convert_columns(
         rows: numbers of the messages, (messages,).
         columns: their fields by path, (messages,) each.
         source: the source.
-        places: place of each of its values among those that its node receives.
+        places: index of each of its values among those that its node receives.
         size: how many values the node receives.
 
     Raises:
         LayoutError: a stamp, a count or part of a value that is none, which reading message by message then names.
     """
     values = np.full((len(rows), size), np.nan)
-    for column, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+    for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
         value = _read_values(columns, path)
-        values[:, column] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # Stamps and counts have to be what a message alone is asked for: set, and whole numbers.
+        values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
+    # A stamp has to be set, so not 0, and of 32 bits, so that the nanoseconds fit into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
@@ -264,6 +266,7 @@ def _convert_columns(
         time += source.time.shift
     if source.sequence is None:
         return Readings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
+    # A count has to be a whole number from 0 on.
     sequence = columns[source.sequence.path]
     if sequence.dtype.kind not in "iu" or np.any(sequence.astype(np.int64) < 0):
         raise LayoutError

@@ -114,7 +114,7 @@ def read_events(
 
 def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: bool) -> EventTable:
     """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
-    events = EventTable(sources.network, sources.step)
+    events = EventTable(sources.network, sources.step_seconds)
     for part in parts_of(path) or [path]:
         if holds_messages(part):
             found = _append_messages_by_topic(part, read_mcap_messages(part, sources), sources, events, strict)
@@ -169,7 +169,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
     Raises:
         ValueError: messages of both kinds, or of topics without sources.
     """
-    events = None if sources is None else EventTable(network, sources.step)
+    events = None if sources is None else EventTable(network, sources.step_seconds)
     is_rows = isinstance(path, StoreTable) or is_table(path)
     own = OwnMessages(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
@@ -197,7 +197,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
 
 def _read_log(path: Path, table: object, sources: Sources, strict: bool) -> EventTable:
     """Return the events of a vehicle's log; `table` are its sources as the network's file has them."""
-    events = EventTable(sources.network, sources.step)
+    events = EventTable(sources.network, sources.step_seconds)
     _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)
     return events
 
@@ -306,5 +306,5 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     events.notes += [f"{path}: {note}" for note in (*sources.notes, *sources.senders.describe_several_senders())]
     if sources.stored:
         events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
-    if sources.steps is False and not len(events) and not events.reasons and not events.broken:
+    if sources.time_counts_steps is False and not len(events) and not events.reasons and not events.broken:
         raise fail(str(path), f"a message of the sources, {', '.join(sources.topics[:8])}", "none")

@@ -60,31 +60,31 @@ class Sources:
         self.network, self.others = network, others
         # What is counted and noted of the messages that come.
         self.senders, self.clocks = SenderCounter(), TopicClocks()
-        self.unknown = Counter[str]()  # messages of topics that are not in the table
-        self.stored = 0  # messages that only their arrival would date, which is that of a new subscriber
+        self.unknown = Counter[str]()  # messages of topics that are not in the table, by topic
+        self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
         self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
-        # By source's topic and path: the error of the first message without the field; fields that were there.
+        # By pattern of topics and path of a field: the error of the first message without it; which ones have come.
         self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
-        # By plant and node the newest reading, its moment, and whether the count has moved.
+        # By plant and node: the newest reading, its moment, and whether its count ever differed from the one before.
         self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
-        # Whether time counts steps; names of the numbers of each node, and of the inputs.
-        self.steps = TIME_STEP not in network.inputs
+        self.time_counts_steps = TIME_STEP not in network.inputs
+        # By node, and of the inputs: the names of its numbers.
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
-        # The sources of each topic of the table, checked; then of each topic that came, and the fields that they use.
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
         self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
-        self._known: dict[str, list[MappedSource]] = {}
-        self._asked: dict[str, set[str]] = {}
-        # Words of devices that say whether they are online; seconds of a step, where times are dates.
+        # By topic that came, found when first asked for: its sources, and the fields that they use.
+        self._sources_of_topic = dict[str, list[MappedSource]]()
+        self._fields_of_topic = dict[str, set[str]]()
         mapped = [single for several in self._table.values() for single in several]
         self.words = DeviceStatuses(condition for single in mapped for condition in single.source.available)
-        steps = {single.source.step for single in mapped}
-        if len(steps) > 1:
-            raise fail("sources, step", "the same of all", sorted(map(str, steps)))
-        self.step = next(iter(steps), None)
+        # Where dates are counted in steps: the seconds of one.
+        step_lengths = {single.source.step for single in mapped}
+        if len(step_lengths) > 1:
+            raise fail("sources, step", "the same of all", sorted(map(str, step_lengths)))
+        self.step_seconds = next(iter(step_lengths), None)
 
     @property
     def topics(self) -> list[str]:
@@ -134,20 +134,20 @@ class Sources:
 
     def list_fields(self, topic: str) -> set[str]:
         """Return the fields of a topic's messages that a source uses, by the first word of their paths."""
-        if topic not in self._asked:
-            asked = self._asked.setdefault(topic, set())
+        if topic not in self._fields_of_topic:
+            fields = self._fields_of_topic.setdefault(topic, set())
             for source, *_ in self.of(topic):
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
                 paths = [part for path in source.paths for part in ((path,) if isinstance(path, str) else path.parts)]
-                asked |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
-        return self._asked[topic]
+                fields |= {path.split(".")[0] for path in (*names, *paths, *source.where)}
+        return self._fields_of_topic[topic]
 
     def of(self, topic: str) -> list[MappedSource]:
         """Return the sources of a topic, each with the places of its values in the node's measurement."""
-        if topic not in self._known:
+        if topic not in self._sources_of_topic:
             matching = [items for pattern, items in self._table.items() if match_topic(topic, pattern)]
-            self._known[topic] = [source for items in matching for source in items]
-        return self._known[topic]
+            self._sources_of_topic[topic] = [source for items in matching for source in items]
+        return self._sources_of_topic[topic]
 
     def take_word(self, topic: str, payload: object, where: str) -> bool:
         """Note what a device says of itself, online or offline; return whether the message is such a word.
@@ -187,21 +187,22 @@ class Sources:
         """Return a reading as it is; of a copy of the node's message before, with the time of that.
 
         A copy has the same count and values, and comes within ten seconds: gateways and senders repeat messages, and
-        the time may be that of the reception. Where a node's count has never moved it names nothing.
+        the time may be that of the reception. Where a node's count has always been the same it tells no copies.
 
         Args:
             reading: what came.
             arrival: nanoseconds since 1970 when it arrived; None where that is not known.
         """
         moment = reading.time if arrival is None else arrival
-        if reading.sequence is None or reading.time is None or moment is None or (self.steps and self.step is None):
+        has_no_seconds = self.time_counts_steps and self.step_seconds is None
+        if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
             return reading
         key = reading.plant, reading.node
-        before, moment_before, moved = self._last.get(key, (reading, -COPY - 1, False))
-        may_be_copy = reading.sequence == before.sequence and moved and 0 <= moment - moment_before <= COPY
+        before, moment_before, count_moved = self._last.get(key, (reading, -COPY - 1, False))
+        may_be_copy = reading.sequence == before.sequence and count_moved and 0 <= moment - moment_before <= COPY
         if may_be_copy and np.array_equal(reading.values, before.values, equal_nan=True):
             return reading._replace(time=before.time)
-        self._last[key] = reading, moment, moved or reading.sequence != before.sequence
+        self._last[key] = reading, moment, count_moved or reading.sequence != before.sequence
         return reading
 
     def describe_absent_field(self) -> str:
@@ -224,13 +225,13 @@ class Sources:
             raise fail(f"{where}, node", f"one of {', '.join(mapped.places)}", _suggest_name(node, mapped.places))
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
-        # Of a message that has its count values may be absent: it measured nothing.
+        # A message that has its count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
-        columns = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
-        for column, path, scale, offset in columns:
+        parts = zip(mapped.places[node], source.paths, source.scale, source.offset, strict=True)
+        for place, path, scale, offset in parts:
             try:
-                values[column] = scale * _read_value(message, path, where, source.quoted) + offset
+                values[place] = scale * _read_value(message, path, where, source.quoted) + offset
                 if sequence is not None:
                     self.found.add((pattern, str(path)))
             except MissingFieldError as error:
@@ -256,14 +257,14 @@ class Sources:
     ) -> Reading | None:
         """Return plant, node, count and time of a message that could not be read, as a reading whose values are NaN.
 
-        None if these cannot be read either, or if it has no count, unless it is refused for a reason of its own.
-        `error`: why it could not be read.
+        None where its names cannot be read either, and where it has no count: then it tells nothing of lost messages.
+        One that was refused by its flag or count is reported without a count too. `error`: why it could not be read.
         """
         sequence, is_count_absent = None, False
         try:
             plant, node = _read_names(mapped, topic, message, where)
             sequence, is_count_absent = self._read_message_count(mapped.source, mapped.pattern, message, where)
-        except RefusedError:  # by its count: its names are read
+        except RefusedError:  # raised by the count; plant and node have been read before it
             pass
         except InputError:
             return None
@@ -283,13 +284,12 @@ class Sources:
         if source.sequence is None:
             return None, False
         path = source.sequence.path
-        key = pattern, path
         try:
             value = field_at(message, path, where)
         except MissingFieldError as error:
-            self.absent.setdefault(key, str(error))
+            self.absent.setdefault((pattern, path), str(error))
             return 0, True
-        self.found.add(key)
+        self.found.add((pattern, path))
         name = f"{where}, field {path!r}"
         return source.sequence.check(convert_count(value, name, source.quoted), name), False
 
@@ -318,11 +318,12 @@ class Sources:
             if node not in self.names:
                 raise fail(f"{name}, node", f"one of {', '.join(self.names)}", _suggest_name(node, self.names))
             places = {node: self._index_outputs(name, source, node)}
-        else:  # messages name it: one of those that have these outputs
+        else:  # messages name their node, which may be any that has these outputs
             fitting = [each for each in self.names if each != INPUTS and self._has_outputs(each, source)]
             places = {each: self._index_outputs(name, source, each) for each in fitting}
             if not places:
                 raise fail(f"{name}, output", "outputs of a node", show_value(source.outputs or len(source.paths)))
+        # `of` raises where the topic has not the level that a condition asks for; "#" may be of any levels.
         for condition in source.available if "#" not in topic else ():
             condition.of(topic)
         self._check_kind_of_time(name, source)
@@ -339,12 +340,12 @@ class Sources:
         They are that if they are in steps, or moments of which each is of the nearest step.
         """
         are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
-        if self.steps == are_steps:
+        if self.time_counts_steps == are_steps:
             return
         expected = (
             "the seconds of a step (step=0.1), or a time field in steps (time=..., time_unit='step'), "
             "since the network counts steps: no input 'dt'"
-            if self.steps
+            if self.time_counts_steps
             else "a time that is no step, since the network's time is continuous"
         )
         got = f"{show_value(source.time and source.time.path)} in {source.time_unit}"

@@ -222,7 +222,7 @@ class Translator:
         """
         if reading.time is None:
             return arrival
-        if self.sources.steps and self.sources.step is None:
+        if self.sources.time_counts_steps and self.sources.step_seconds is None:
             return float(reading.time)
         time = date_of(reading.time)
         is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # a clock that was never set
