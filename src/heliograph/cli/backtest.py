@@ -82,7 +82,7 @@ def backtest(
             truth=truth,
             skip=skip,
             refit=_make_refit(network, data.recording, advance) if refit else None,
-            every=refit or 1,  # without a refit it says nothing, but has to be positive
+            every=refit or 1,  # not used without a refit
         )
 
     def make_results(found: "heliograph.forecasting.Backtest") -> "Results":

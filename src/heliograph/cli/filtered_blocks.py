@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from heliograph.cli.filtered_plant import filter_rows
 from heliograph.cli.reading import ReadingOptions, describe_refused
@@ -26,6 +26,13 @@ class AllRowsNeededError(Exception):
     """Why all rows of a recording are held in memory at once, in words."""
 
 
+class SaidOfBlocks(NamedTuple):
+    """Lines on a table that was filtered in blocks: warnings, and what was written."""
+
+    warnings: list[str]
+    summary: list[str]
+
+
 def run_in_blocks(
     network: "Network",
     module: Mapping[str, object],
@@ -34,7 +41,7 @@ def run_in_blocks(
     others: Iterable[str],
     options: ReadingOptions,
     advance: "Advance",
-) -> tuple[list[str], list[str]] | None:
+) -> SaidOfBlocks | None:
     """Filter a long table of rows of time, and write the estimates to a table.
 
     Args:
@@ -47,8 +54,8 @@ def run_in_blocks(
         advance: called with the progress.
 
     Returns:
-        The warnings and the summary. None of a table that is not long or has no rows of time, and of one whose
-        rows have to be held at once: that is said.
+        What is to be said of the run. None, and nothing is written, where the table is not long or has no rows of
+        time, and where all its rows have to be held at once; the latter is said on the standard error.
 
     Raises:
         ValueError: what cannot be read; very many rows that are out of order.
@@ -61,7 +68,7 @@ def run_in_blocks(
         return None
     try:
         _check_for_needs(network, out, others)
-        assert isinstance(out, Path)
+        assert isinstance(out, Path)  # as was checked
         return filter_in_blocks(network, measurements, out, options, advance)
     except AllRowsNeededError as needed:
         from heliograph.disk.quoting import visible
@@ -89,7 +96,10 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
 
 
 def _check_for_needs(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
-    """Raise AllRowsNeededError where options, the output or the network need all rows at once."""
+    """Raise AllRowsNeededError where options, the output or the network need all rows at once.
+
+    `others`: the options that are given and need them.
+    """
     from heliograph.disk.whole_file import FORMATS
     from heliograph.fusion.network_fusion import Fusion
 
@@ -97,8 +107,9 @@ def _check_for_needs(network: "Network", out: Path | StoreAddress | None, others
         raise AllRowsNeededError(f"{' and '.join(given)} {'need' if len(given) > 1 else 'needs'} them")
     if not isinstance(out, Path) or out.suffix.lower() not in FORMATS:
         raise AllRowsNeededError(f"blocks go to {' or '.join(FORMATS)} alone, not to {out}")
-    late = [name for name, fused in network.fused.items() if isinstance(fused, Fusion) and fused.by_report]
-    if late := [*network.meshes, *late]:
+    # Fusions whose messages take rows on their way, perhaps into the next block.
+    of_centres = [name for name, fused in network.fused.items() if isinstance(fused, Fusion) and fused.by_report]
+    if late := [*network.meshes, *of_centres]:
         raise AllRowsNeededError(f"messages of the fusion {late[0]} may come rows later")
 
 
@@ -110,8 +121,8 @@ def filter_in_blocks(
     advance: "Advance",
     block: BlockSize = USUAL_BLOCK,
     most: int = MOST,
-) -> tuple[list[str], list[str]]:
-    """Filter the rows of a table and write the estimates, block by block; return the warnings and the summary.
+) -> SaidOfBlocks:
+    """Filter the rows of a table and write the estimates, block by block; return what is to be said of it.
 
     Args:
         network: the network.
@@ -136,25 +147,31 @@ def filter_in_blocks(
         advance(f"filtering {path}", done, total)
 
     blocks = RecordingBlocks(path, network, options.strict, options.ignore_unknown, block, progress)
-    written, doubts, record = WrittenRows(), BlockLines(), None
+    written, doubts = WrittenRows(), BlockLines()
+    record = None  # of the block before, from whose end the filters go on
     try:
         with open_table(out) as append:
             for recording in blocks:
+                # Numbers over all rows are printed of errors, and of values that filters doubt.
                 if recording.truth is not None:
                     raise AllRowsNeededError("errors are of the truth in all of them")
-                record, given = filter_rows(network, recording, after=record)
+                record, warned = filter_rows(network, recording, after=record)
                 if weighing := [f"{node}/{name}" for node, filters in record.weighed.items() for name in filters]:
                     raise AllRowsNeededError(f"what {weighing[0]} weighs is judged by all of them")
                 append(estimate_columns(record))
                 written.add(record)
-                doubts.add([*record.failures(), *given], written.rows - len(record.time) + 1, written.rows)
+                first_row = written.rows - len(record.time) + 1
+                doubts.add([*record.failures(), *warned], first=first_row, last=written.rows)
     except RowsNotInBlocksError as error:
+        # A table of up to `most` rows is read once more as a whole; of a longer one that would take too much memory.
         if blocks.expected_rows > most:
             limit = f"more than {most:,} rows are read in blocks of {block.rows:,}, and may be out of order within one"
             raise InputError(f"{error}: {limit}: sort the file by time, or correct the row") from None
         raise AllRowsNeededError(str(error)) from None
     refused = [describe_refused(path, "rows", blocks.refused, list(map(str, blocks.reasons)))] if blocks.refused else []
-    return [*refused, *blocks.notes, *blocks.doubts, *doubts.list_lines()], [written.describe(out)]
+    return SaidOfBlocks(
+        warnings=[*refused, *blocks.notes, *blocks.doubts, *doubts.list_lines()], summary=[written.describe(out)]
+    )
 
 
 class WrittenRows:
@@ -166,7 +183,8 @@ class WrittenRows:
 
     def __init__(self) -> None:
         self.rows = 0
-        self._claims, self._without = dict[str, str](), Counter[str]()
+        # By NODE/FILTER: what its estimates claim, and in how many rows they claim nothing.
+        self._claims, self._rows_without = dict[str, str](), Counter[str]()
 
     def add(self, record: "Record") -> None:
         """Count the rows of a record."""
@@ -175,13 +193,16 @@ class WrittenRows:
             for name, estimate in filters.items():
                 self._claims[f"{node}/{name}"] = estimate.claim
                 if estimate.claim != "none":
-                    self._without[f"{node}/{name}"] += int((estimate.claims == "none").sum())
+                    self._rows_without[f"{node}/{name}"] += int((estimate.claims == "none").sum())
 
     def describe(self, *places: object) -> str:
-        """Return a line on what was written where, such as "out.csv: 3 rows of a/kf (exact, none of 2 rows)"."""
+        """Return a line on what was written where: "out.csv: 3 rows of a/kf (exact, none of 2 rows)".
+
+        These have a claim "exact", but for 2 rows in which nothing is claimed.
+        """
         filters = []
         for name, claim in self._claims.items():
-            without = f", none of {self._without[name]} rows" if self._without[name] else ""
+            without = f", none of {self._rows_without[name]} rows" if self._rows_without[name] else ""
             filters.append(f"{name} ({claim}{without})")
         return f"{' and '.join(map(str, places))}: {self.rows} rows of {', '.join(filters)}"
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from heliograph.report.results import Json, Results
     from heliograph.simulation.network import Network
 
+STAGES = 6  # of the work, for the progress bar
 STEPS = 100  # that a climb takes at most
 
 
@@ -66,7 +67,7 @@ def fit(
             """Learn with the options of the command."""
             return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
 
-        learned = write_results(out, 6, work, lambda learning: collect_results_files(learning, out, network))
+        learned = write_results(out, STAGES, work, lambda learning: collect_results_files(learning, out, network))
         print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
@@ -86,7 +87,19 @@ def learn(
     reading: ReadingOptions,
     stop: GentleStop,
 ) -> "FitResults":
-    """Fit the free numbers to the earlier rows, and judge the filters on the later ones."""
+    """Fit the free numbers to the earlier rows, and judge the filters on the later ones.
+
+    Args:
+        network: the network as the user names it, FILE or FILE:NAME.
+        measurements: where the data are.
+        starts: from how many points to climb.
+        seed: seed of the starts.
+        held_out: share of the rows, the last ones, that only judge.
+        advance: called with the progress.
+        truth: whether to learn from true states.
+        reading: how the data are read.
+        stop: signals of the user; after one no further part begins, and what is left out is empty.
+    """
     advance("starting")
     from dataclasses import replace
 
@@ -106,21 +119,21 @@ def learn(
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
-    cut = rows - int(held_out * rows)
-    fitted = _fit_with_progress(build, recording, cut, starts, seed, truth, advance, stop)
+    learned_rows = rows - int(held_out * rows)
+    fitted = _fit_with_progress(build, recording, learned_rows, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
-    # Predictions before and after the fit, then statistics of the losses.
+    # How well the later rows were predicted before and after the fit; whether what was predicted then holds.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
     changes: list[Change] = []
     uniform: list[Uniformity] = []
-    if cut < rows:
-        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, cut)) or []
+    if learned_rows < rows:
+        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
     if changes:
-        uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, cut)) or []
+        uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
     advance("looking at losses")
     losses = stop.unless_stopped(lambda: _learn_lossy(start, recording)) or {}
-    return FitResults(network, str(measurements), fitted, cut, rows - cut, changes, uniform, losses)
+    return FitResults(network, str(measurements), fitted, learned_rows, rows - learned_rows, changes, uniform, losses)
 
 
 def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
@@ -202,7 +215,7 @@ def _fit_with_progress(
     def show_progress(line: str) -> None:
         """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
         stop.check()
-        stop.begin()
+        stop.begin()  # from here on there is a best so far, which the next signal keeps
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)

@@ -60,21 +60,21 @@ def replay(
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
     check_seed("--seed", seed)
     options = ReadingOptions(strict=strict, ignore_unknown=ignore_unknown)
-    # Events of each plant of the recording, and those that arrive through the link.
-    sent = []
+    # Of each plant of the recording the messages that arrive through the link: (arrival, line), by arrival.
+    messages_of_plants = []
     for i, (name, events, origin) in enumerate(_read_events(recording, network, options)):
         received = simulate_link(events, link, seed + i) if trace is None else delay_as_traced(events, trace)
-        sent.append(encode_messages(received, name if plant is None else plant, origin))
-    # Wait for each arrival on the clock, speeded up.
-    begun, first = monotonic(), None
+        messages_of_plants.append(encode_messages(received, name if plant is None else plant, origin))
+    # Print each line when it is due: as long after the first as it arrived, by `speed` sooner.
+    begun, first_arrival = monotonic(), None
     try:
-        for arrival, line in merge(*sent, key=lambda pair: pair[0]):
-            first = arrival if first is None else first
-            while speed is not None and (early := begun + (arrival - first) / speed - monotonic()) > 0:
-                sleep(min(early, LONGEST))
+        for arrival, line in merge(*messages_of_plants, key=lambda message: message[0]):
+            first_arrival = arrival if first_arrival is None else first_arrival
+            while speed is not None and (left := begun + (arrival - first_arrival) / speed - monotonic()) > 0:
+                sleep(min(left, LONGEST))
             print(line, flush=speed is not None)
         sys.stdout.flush()
-    except BrokenPipeError:  # nobody reads any more
+    except BrokenPipeError:  # nobody reads any more; Python would report it again when it closes its output
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -83,7 +83,7 @@ def _read_events(
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield name, events and date of time 0 of each plant; the date is None where times are no dates.
 
-    A recording has events, or rows of time, which are one plant's: then `read_events` returns None.
+    A recording has events, or rows of time, which are those of one plant. Warnings and notes go to the standard error.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.network_file import load_module
@@ -96,7 +96,7 @@ def _read_events(
         """Show nothing: the standard output is a pipe."""
 
     table = read_events(path, reference, network, module, options, no_progress)
-    if table is None:
+    if table is None:  # rows of time
         rows = read_rows(path, network, options)
         for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)
@@ -106,11 +106,11 @@ def _read_events(
 
     from heliograph.cli.reading import describe_unread
 
-    finer: list[str] = []
+    lines_on_digits: list[str] = []
     if table.dated:
         times = [columns.time for name in table.plants for columns in table.of(name).columns.values()]
-        finer = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]"))
-    for line in [*describe_unread(path, table), *table.notes, *finer]:
+        lines_on_digits = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]"))
+    for line in [*describe_unread(path, table), *table.notes, *lines_on_digits]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)

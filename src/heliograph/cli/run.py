@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 BAGS = {".mcap", ".db3", ".bag"}
+STAGES = 4  # that the progress bar shows: starting, reading, filtering, writing
 
 
 def run(
@@ -65,12 +66,13 @@ def run(
     from heliograph.report.progress import progress
 
     # Check the options before JAX is imported.
-    later, options = _parse_smoothing(smooth), reading or ReadingOptions()
-    given = {"--report": report, "--smooth": smooth, "--forecast": forecast, "--predicted": predicted}
-    wanted = [name for name, value in given.items() if value]
-    _check_options(measurements, out, report, lag, options, wanted)
-    ahead = horizons_in(forecast) if forecast else None
-    with progress(4) as advance:
+    smoother, options = _parse_smoothing(smooth), reading or ReadingOptions()
+    # The options by which more than estimates of each row is made: they need all rows at once.
+    more = {"--report": report, "--smooth": smooth, "--forecast": forecast, "--predicted": predicted}
+    needing_all_rows = [name for name, value in more.items() if value]
+    _check_options(measurements, out, report, lag, options, needing_all_rows)
+    horizons = horizons_in(forecast) if forecast else None
+    with progress(STAGES) as advance:
         advance("starting")
         from heliograph.files.network_file import load_module
 
@@ -78,17 +80,21 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        # A long table in blocks, anything else as a whole.
-        said = run_in_blocks(loaded, module, measurements, out, wanted, options, advance) if lag is None else None
-        measured = read_measured(measurements, network, loaded, module, options, advance) if said is None else []
+        # A long table is filtered in blocks, which says what it wrote; anything else is read as a whole.
+        said_of_blocks = None
+        if lag is None:
+            said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
+        measured = []
+        if said_of_blocks is None:
+            measured = read_measured(measurements, network, loaded, module, options, advance)
         if lag is not None and measured[0].events is None:
             raise fail("--lag", "messages or events", f"rows of time in {measurements}")
-        # Each plant by itself.
+        # Each plant by itself, with the place where its estimates were written.
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
-            plant = filter_plant(loaded, data, later, ahead, predicted)
-            place = out and place_of_plant(out, data.plant, len(measured) > 1)
+            plant = filter_plant(loaded, data, smoother, horizons, predicted)
+            place = out and place_of_plant(out, data.plant, several=len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
                 plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
@@ -97,8 +103,8 @@ def run(
     if report is not None:
         _write_report(network, loaded, [plant for plant, _ in done], report)
     lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
-    for doubted, summary in lines if said is None else [said]:
-        _print_lines(list(dict.fromkeys(doubted)), summary)
+    for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
+        _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
@@ -134,7 +140,10 @@ def _check_options(
     options: ReadingOptions,
     wanted: "Sequence[str]",
 ) -> None:
-    """Check that the options fit together and files can be written; `wanted`: the options by which more is written."""
+    """Check that the options fit together and that files can be written.
+
+    `wanted`: the options that are given of --report, --smooth, --forecast and --predicted.
+    """
     from heliograph.numerics.check import fail, scalar
 
     if out is None and report is None:
@@ -146,9 +155,10 @@ def _check_options(
             raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
         if out is None:
             raise fail("--lag", "a file for the estimates (--out FILE)", "none")
-    more = [option for option in wanted if option in ("--forecast", "--predicted")]
-    if more and isinstance(out, Path) and out.suffix.lower() == ".mcap":
-        raise fail(more[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
+    # These add rows and columns to a table; a bag has no place for them.
+    tabular = [option for option in wanted if option in ("--forecast", "--predicted")]
+    if tabular and isinstance(out, Path) and out.suffix.lower() == ".mcap":
+        raise fail(tabular[0], "a table of estimates (--out FILE.csv or FILE.parquet)", str(out))
     _check_output_places(measurements, out, report)
 
 

@@ -144,7 +144,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     try:
         with name_path_in_errors(paths[0]):
             yield partials
-        # One by one; that of the last is the end, after which nothing is undone.
+        # Once the last is replaced nothing is undone, so that its earlier content need not be kept.
         with hold_signals():
             for partial, path in zip(partials, paths, strict=True):
                 before = path.read_bytes() if path != paths[-1] and path.exists() else None
@@ -152,13 +152,16 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
                     replace(partial, path)
                 replaced.append((path, before))
     except BaseException:
-        # Undo: remove temporary files, restore those that were replaced.
+        # Remove temporary files, and undo: files that are new go, others get their earlier contents.
         with hold_signals():
             for partial in partials:
                 partial.unlink(missing_ok=True)
-            if len(replaced) < len(paths):
-                for path, before in replaced:
-                    path.unlink() if before is None else path.write_bytes(before)
+            are_all_replaced = len(replaced) == len(paths)
+            for path, before in () if are_all_replaced else replaced:
+                if before is None:
+                    path.unlink()
+                else:
+                    path.write_bytes(before)
         raise
 
 
@@ -246,6 +249,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
             temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
             (temporary / "new").mkdir()
             lock.enter_context(try_lock(temporary))
+        # The lock goes before the folder is renamed.
         with lock, name_path_in_errors(target):
             yield temporary / "new"
             flush_tree_to_disk(temporary / "new")

@@ -35,7 +35,7 @@ class BlockOrder:
     """
 
     def __init__(self, path: Path, network: Network):
-        self._path, self._counted = path, TIME_STEP not in network.inputs
+        self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
         self.last: RowsAsColumns | None = None
         self._first: RowsAsColumns | None = None
         self._disordered: RowsAsColumns | None = None  # two rows of which the second came after a later one
@@ -43,7 +43,11 @@ class BlockOrder:
         self._left_out = list[RowsAsColumns]()  # of each block those with the least and the greatest time
 
     def add(self, came: RowsAsColumns, ordered: RowsAsColumns) -> None:
-        """Go on with the rows of a block as they came, and those that are left in the order of their times.
+        """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
+
+        Args:
+            came: rows of the block as they came.
+            ordered: those that are left of them, in the order of their times.
 
         Raises:
             RowsNotInBlocksError: only all rows together say in which order they are.
@@ -57,24 +61,26 @@ class BlockOrder:
         self.last = ordered.of(slice(-1, None))
         if self._first is None:
             self._first = ordered.of(slice(1))
-        if self._counted:
+        if self._rows_are_steps:
             return
-        year = _year(rows.time)
-        if len(jumps := np.flatnonzero(np.diff(rows.time) > year)):
+        # A step of more than a year, and rows out of order, in whichever blocks: the rows behind the step may all have
+        # stamps that were not set, which a block cannot tell.
+        if len(jumps := np.flatnonzero(np.diff(rows.time) > _year(rows.time))):
             self._jump = rows.of(slice(int(jumps[0]), int(jumps[0]) + 2))
         if (row := find_backwards_row(came.time)) is not None:
             self._disordered = came.of(slice(row - 1, row + 1))
         if self._jump is not None and self._disordered is not None:
             raise self._refuse(self._disordered, "times in order, in a recording with steps of more than a year")
+        # What the block left out is compared with all rows at the end: its earliest and its latest stand for it.
         left_out = came.of(~np.isin(came.numbers, ordered.numbers))
         if len(left_out.numbers):
             self._left_out.append(left_out.of(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
     def end(self) -> None:
-        """Check what was left out against all rows.
+        """Check that all rows that blocks left out are more than a year outside of all that stay.
 
         Raises:
-            RowsNotInBlocksError: something that is not outside of them.
+            RowsNotInBlocksError: one that is not.
         """
         if self._first is None or self.last is None:
             return

@@ -19,6 +19,15 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicate", "conflict", "late", "future"))
+FEWEST_FALLS = 3  # of a count from one number, before that is taken for its largest
+
+
+class UnsetStamps(NamedTuple):
+    """What is said of stamps that were not set."""
+
+    note: str = ""  # on the clock
+    reason: str = ""  # why events were removed
+    count: int = 0  # of those
 
 
 @dataclass
@@ -108,21 +117,21 @@ class NodeEvents:
         """
         if not self.period or not len(self.time):
             return []
-        # Counts in order of time, and from each to the next.
+        lines = list[str]()
+        # Counts in order of time, and the difference of each to the next.
         time, _, sequence = self.arrays()
         order = np.lexsort((sequence, time))
-        counts, steps = sequence[order], np.diff(sequence[order])
-        lines = list[str]()
-        largest, before_falls = int(counts.max()), counts[:-1][steps < 0]
-        bits = (largest + 1).bit_length() - 1
-        is_full = largest + 1 == 1 << bits and largest + 1 < self.period
-        if is_full and len(before_falls) >= 3 and np.all(before_falls == largest):
+        counts, differences = sequence[order], np.diff(sequence[order])
+        # Whether the largest number is all ones in fewer bits than were said, and each fall is from it.
+        largest, before_falls = int(counts.max()), counts[:-1][differences < 0]
+        bits = largest.bit_length()
+        is_all_ones = largest + 1 == 1 << bits and largest + 1 < self.period
+        if is_all_ones and len(before_falls) >= FEWEST_FALLS and np.all(before_falls == largest):
             lines.append(
                 f"{name}: the count begins at 0 again after {largest}, not after {self.period - 1}: bits={bits}; until "
                 "then what is lost is counted wrongly"
             )
-        # The same count at a later time.
-        repeated = int(np.sum((steps == 0) & (np.diff(time[order]) > 0)))
+        repeated = int(np.sum((differences == 0) & (np.diff(time[order]) > 0)))
         if repeated:
             lines.append(
                 f"{name}: the count of {repeated} messages is that of the one before: repeated, not measured anew"
@@ -134,34 +143,34 @@ class NodeEvents:
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
-    def drop_unset_stamps(self, name: str) -> tuple[str, str, int]:
-        """Remove events whose stamps were not set; return a note on the clock, why some were removed, and how many.
+    def drop_unset_stamps_in_place(self, name: str) -> UnsetStamps:
+        """Remove the events whose stamps were not set; return what is to be said of that. `name`: of the node.
 
-        A stamp that is more than a year before its arrival was not set; where most are, they are of another clock, and
-        each event arrives when it was measured. Where arrivals are not known, neither was one that is more than a year
-        away from the messages before and after it, which go on from one to the other. Numbers are seconds. `name`: of
-        the node. Both texts are "" where there is nothing to say.
+        A stamp that is more than a year before its arrival was not set. Where most are, stamps and arrivals are of two
+        clocks: then nothing is removed, and each event arrives when it was measured. Where no arrivals are known a
+        stamp was not set that is more than a year away from those before and after it, which are near each other.
         """
         time, arrival, _ = self.arrays()
-        late, year = arrival - time, YEAR / SECOND if self.numbers else YEAR
+        delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds
         if not len(time):
-            return "", "", 0
-        if np.median(late) > year:
+            return UnsetStamps()
+        if np.median(delays) > year:
             self.arrival = array(self.time.typecode, self.time)
-            return f"{name}: stamps and arrivals are of two clocks: each event arrives when it was measured", "", 0
-        # An arrival that is no event's own time is known.
-        are_arrivals_known = bool(late.any())
-        unset = late > year if are_arrivals_known else find_unset_stamps(time, year)
+            two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"
+            return UnsetStamps(note=f"{name}: {two_clocks}")
+        # Where arrivals are not known each is the event's own time.
+        are_arrivals_known = bool(delays.any())
+        unset = delays > year if are_arrivals_known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:
-            return "", "", 0
+            return UnsetStamps()
         self._note_unset(unset, are_arrivals_known)
         first = time[np.argmax(unset)]
         moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
         near = "that of arrival" if are_arrivals_known else "the others in order"
         why = fail(name, f"a time that was set, near {near}", f"{moment} in {count} of {len(time)} messages")
         self.keep_events(~unset)
-        return "", str(why), count
+        return UnsetStamps(reason=str(why), count=count)
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
         """Note events with unset stamps as messages that came and are no events: moments near them, and counts.
@@ -177,10 +186,7 @@ class NodeEvents:
 
 
 class ArrivedEvents(NamedTuple):
-    """Events in order of arrival: node (-1: inputs), time, arrival, count, and index among those of the node.
-
-    Shapes: all (events,).
-    """
+    """Events in order of arrival, (events,) each: node (-1: inputs), time, arrival, count, index among its node's."""
 
     node: np.ndarray
     time: np.ndarray
@@ -215,29 +221,31 @@ def judge_events(
     """
     verdicts = np.full(len(events.time), USED)
     verdicts[events.time > events.arrival + ahead] = FUTURE
-    # Of the events that are not in the future: rank of the row of each, in order of time; an event in a row of its own
-    # stands after inputs of its time, then by node and count. Events of one identity are of one node, time and count.
+    # The events that are not in the future, and a number for each node, time and count that occurs among them: its
+    # identity. Identities are in order of time; of one time inputs come first, as node -1, then nodes and counts.
     candidates = np.flatnonzero(verdicts != FUTURE)
     some = events.of(candidates)
     identity = _rank_rows(some.time, some.node, some.sequence)
-    rank = _rank_rows(some.time) if joint else identity
-    # Late: its row was final before it came. The newest final row is the base, where in a row of its own the event
-    # itself may stand, which is then a copy.
-    newest_final = _find_newest_final(some, rank, window)
-    verdicts[candidates[rank <= newest_final if joint else rank < newest_final]] = LATE
-    # Copies, of one identity, and rivals: events of a node in one row. Most have neither.
-    rivals = _rank_rows(some.time, some.node) if joint else identity
-    has_rivals: Bool[np.ndarray, " rows"] = np.bincount(rivals, minlength=1) > 1
-    contenders = np.flatnonzero(has_rivals[rivals] & (rank >= newest_final))
-    _judge_copies(verdicts, candidates[contenders], identity[contenders], rivals[contenders], values, joint)
+    # The number of the row that each belongs to, in order of time: that of its time, or one of its own.
+    row = _rank_rows(some.time) if joint else identity
+    # Late: the row was final before the event came. If that is the newest final row and not joint, an event of the
+    # same identity made it: this one is a copy, and judged as such.
+    newest_final = _find_newest_final(some, row, window)
+    is_late = row <= newest_final if joint else row < newest_final
+    verdicts[candidates[is_late]] = LATE
+    # Events that may take each other's place: of one node in one row. Most are alone there, and stay used.
+    place = _rank_rows(some.time, some.node) if joint else identity
+    has_rivals: Bool[np.ndarray, " places"] = np.bincount(place, minlength=1) > 1
+    contenders = np.flatnonzero(has_rivals[place] & (row >= newest_final))
+    _judge_copies(verdicts, candidates[contenders], identity[contenders], place[contenders], values, joint)
     return verdicts
 
 
 def _judge_copies(
     verdicts: Int[np.ndarray, " events"],
     numbers: np.ndarray,
-    identity: np.ndarray,
-    rivals: np.ndarray,
+    identities: np.ndarray,
+    places: np.ndarray,
     values: Callable[[int], np.ndarray],
     joint: bool,
 ) -> None:
@@ -246,25 +254,25 @@ def _judge_copies(
     Args:
         verdicts: verdicts on all events, which are changed.
         numbers: numbers of the events to judge, in order of arrival.
-        identity: for each of these, the number of its node, time and count.
-        rivals: for each, the number of its row and node if rows are joint, else of its identity.
+        identities: for each of these, a number that stands for its node, time and count.
+        places: for each, a number that stands for its row and node if rows are joint, else its identity.
         values: the values of the event with a number.
         joint: whether all events of one time are one row.
     """
     first_of_identity = dict[int, int]()  # the number of the first event of each identity, which stays
-    filled = dict[int, np.ndarray]()  # by row and node the mask of the components that have a value
-    for k, name, row in zip(numbers.tolist(), identity.tolist(), rivals.tolist(), strict=True):
-        if name in first_of_identity:
-            same = np.array_equal(values(k), values(first_of_identity[name]), equal_nan=True)
-            verdicts[k] = DUPLICATE if same else CONFLICT
-        elif verdicts[k] == USED:
-            present = ~np.isnan(values(k))
-            filled_before = filled.get(row, np.zeros_like(present))
-            if joint and np.any(present & filled_before):
-                verdicts[k] = CONFLICT
+    filled = dict[int, np.ndarray]()  # by place the mask of the components that have a value
+    for event, identity, place in zip(numbers.tolist(), identities.tolist(), places.tolist(), strict=True):
+        if identity in first_of_identity:
+            is_same = np.array_equal(values(event), values(first_of_identity[identity]), equal_nan=True)
+            verdicts[event] = DUPLICATE if is_same else CONFLICT
+        elif verdicts[event] == USED:
+            present = ~np.isnan(values(event))
+            filled_before = filled.get(place, np.zeros_like(present))
+            if joint and np.any(present & filled_before):  # a second value of a component in its row
+                verdicts[event] = CONFLICT
             else:
-                first_of_identity[name] = k
-                filled[row] = present | filled_before
+                first_of_identity[identity] = event
+                filled[place] = present | filled_before
 
 
 def count_verdicts(

@@ -181,12 +181,13 @@ class EventTable:
         by_node = [node for plant in self._plants.values() for node in plant.items()]
         # Steps are no stamps; neither are numbers of a network that counts steps.
         for name, columns in by_node if self.dated or not self.steps else ():
-            note, reason, count = columns.drop_unset_stamps(f"{source}, {name}")
-            self.notes += [note] if note else []
+            unset = columns.drop_unset_stamps_in_place(f"{source}, {name}")
+            self.notes += [unset.note] if unset.note else []
             self.notes += columns.describe_doubtful_count(f"{source}, {name}")
-            if reason:
-                self.refuse(InputError(reason), strict)
-                self.refused += count - 1
+            if unset.reason:
+                self.refuse(InputError(unset.reason), strict)
+                self.refused += unset.count - 1  # one was counted with the reason
+        # Without an event the first thing that went wrong is the error.
         if not len(self) and (first := (*self.reasons, self.broken)[0]):
             raise InputError(first)
         for name, columns in () if self.steps else by_node:

@@ -49,22 +49,30 @@ class RowChecks:
 
 def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowChecks) -> RowsAsColumns:
     """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
-    inputs, received, source = network.inputs, list_received_columns(network), checks.source
-    # A relay whose measurements are left out altogether loses its filter only.
+    inputs, source = network.inputs, checks.source
+    # By node the columns that each component of its measurements may have: of several names one.
+    received = list_received_columns(network)
+    # A relay may have no columns at all: the data of other nodes do not need what it received itself, so that only a
+    # filter of its own has nothing to filter.
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
-            del received[name]  # its own filter is left out
+            del received[name]
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
-    expected = [(TIME,), *((name,) for name in inputs), *(names for node in received.values() for names in node)]
     truth_columns = list_truth_columns(network)
-    _refuse_unknown(columns, [*expected, *((name,) for name in truth_columns.values())], source)
+    expected = [
+        (TIME,),
+        *((name,) for name in inputs),
+        *(names for components in received.values() for names in components),
+        *((name,) for name in truth_columns.values()),
+    ]
+    _refuse_unknown(columns, expected, source)
     time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
     measurements = {}
     for node, components in received.items():
         found = [_find_column(columns, names, source) for names in components]
         measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
-    # An input dt may be left out.
+    # All inputs have to be there, but for a time step dt, which times say too.
     given = {
         name: _read_complete(columns, _find_column(columns, (name,), source), checks)
         for name in inputs
@@ -149,5 +157,5 @@ def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> 
 
 
 def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
-    """Return what says in words what stands in a row of a column."""
+    """Return a function that says what stands in a row of a column, by the number of the row."""
     return lambda row: "an empty cell" if np.isnan(values[row]) else f"{values[row]}"

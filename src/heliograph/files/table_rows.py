@@ -12,7 +12,7 @@ from heliograph.numerics.times.row_order import SECOND, YEAR, find_out_of_order,
 from heliograph.numerics.times.row_times import find_backwards_row
 from heliograph.simulation.network import Network
 
-MOST_OUT = 0.5  # share of the rows that may be out of order where each row is a step
+MOST_OUT = 0.5  # share of the rows below which those that are out of order, or whose times were not set, are refused
 
 
 class RowsAsColumns(NamedTuple):
@@ -42,10 +42,10 @@ def join_cells(parts: Sequence[RowsAsColumns]) -> RowsAsColumns:
 def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], int]:
     """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
 
-    A time that is more than a year outside of all others was not set, and its row is refused alone. Where time is
-    continuous the others are put in the order of their times. Where each row is a step the fewest without which times
-    do not go backwards are refused. Beside a column `dt`, which is of the order of the rows, and where half of the
-    steps or more would be refused, rows stay as they are.
+    Where time is continuous a time that is more than a year outside of all others was not set: its row is refused, and
+    the others are put in the order of their times. Where each row is a step, rows are refused until times do not go
+    backwards, as few as possible. Rows stay as they are where half of them or more would be refused, and beside a
+    column `dt`, whose numbers belong to the order of the rows.
 
     Args:
         cells: the rows.
@@ -56,22 +56,23 @@ def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[Row
         return cells, [], 0
     dated = cells.time.dtype.kind == "M"
     stamps = cells.time.astype(np.int64) if dated else cells.time
-    if TIME_STEP not in network.inputs:
-        out, expected = find_out_of_order(stamps), "a time that does not go backwards"
+    is_continuous = TIME_STEP in network.inputs
+    if is_continuous:
+        is_refused = find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND)
+        expected = "a time that was set, near the others"
     else:
-        out, expected = (
-            find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND),
-            "a time that was set, near the others",
-        )
-    if TIME_STEP in cells.inputs or np.mean(out) >= MOST_OUT:
+        is_refused = find_out_of_order(stamps)
+        expected = "a time that does not go backwards"
+    if TIME_STEP in cells.inputs or np.mean(is_refused) >= MOST_OUT:
         return cells, [], 0
     refused = [
         fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
-        for number, time in zip(cells.numbers[out].tolist(), cells.time[out], strict=True)
+        for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
     ]
-    cells = cells.of(~out)
-    behind = int(np.count_nonzero(cells.time < np.maximum.accumulate(cells.time)))
-    return cells.of(np.argsort(cells.time, kind="stable")), refused, behind
+    kept = cells.of(~is_refused)
+    latest_so_far = np.maximum.accumulate(kept.time)
+    behind = int(np.count_nonzero(kept.time < latest_so_far))
+    return kept.of(np.argsort(kept.time, kind="stable")), refused, behind
 
 
 class KeptRows(NamedTuple):

@@ -195,13 +195,14 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
         for name, estimate in filters.items()
     ]
     places = pose.places(record.states)
+    is_on_some_axis = any(state is not None for axes in places for state in axes)
     for k, stamp in enumerate(times):
         for estimates in all_estimates:
             if not estimates.sound[k]:
                 continue
-            if any(state is not None for axes in places for state in axes):
-                bound = None if estimates.claims[k] == "none" else estimates.covariance[k]
-                odometry = _make_odometry(stamp, estimates.mean[k], bound, places, pose, types)
+            if is_on_some_axis:
+                claimed = None if estimates.claims[k] == "none" else estimates.covariance[k]
+                odometry = _make_odometry(stamp, estimates.mean[k], claimed, places, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry
             for topic, number in _yield_numbers(estimates, k, record.states):
                 yield stamp, topic, types[NUMBER](number)
@@ -230,43 +231,46 @@ def _make_odometry(
         stamp: its time in nanoseconds since 1970.
         mean: mean of the states.
         covariance: their covariance; None where none is claimed.
-        places: indices of the states of pose and twist, as `Pose.places` returns them.
+        places: by axis the index of the state that is along or about it, of the pose and of the twist (its velocity),
+            as `Pose.places` returns them.
         pose: names of the frames.
         types: classes of messages by the names of their types.
     """
     geometry = "geometry_msgs/msg/"
     vector, point, quaternion = (types[f"{geometry}{name}"] for name in ("Vector3", "Point", "Quaternion"))
-    # Six numbers each, by axis, and their covariance (36,).
-    (position, position_covariance), (velocity, velocity_covariance) = (
-        _select_pose(mean, covariance, states) for states in places
-    )
+    pose_states, twist_states = places
+    # Six numbers each, three along the axes and three about them, and their covariance (36,).
+    position, position_covariance = _select_pose(mean, covariance, pose_states)
+    velocity, velocity_covariance = _select_pose(mean, covariance, twist_states)
     rotation = quaternion(*_convert_angles_to_quaternion(*position[3:]))
-    pose_message = types[f"{geometry}Pose"](point(*position[:3]), rotation)
-    twist_message = types[f"{geometry}Twist"](vector(*velocity[:3]), vector(*velocity[3:]))
+    pose_message = types[f"{geometry}Pose"](position=point(*position[:3]), orientation=rotation)
+    twist_message = types[f"{geometry}Twist"](linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
     seconds, nanoseconds = divmod(stamp, 10**9)
-    time = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
-    # In the order of the fields of an odometry message.
+    time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     return types[ODOMETRY](
-        types["std_msgs/msg/Header"](time, pose.frame),
-        pose.child,
-        types[f"{geometry}PoseWithCovariance"](pose_message, position_covariance),
-        types[f"{geometry}TwistWithCovariance"](twist_message, velocity_covariance),
+        header=types["std_msgs/msg/Header"](stamp=time, frame_id=pose.frame),
+        child_frame_id=pose.child,
+        pose=types[f"{geometry}PoseWithCovariance"](pose=pose_message, covariance=position_covariance),
+        twist=types[f"{geometry}TwistWithCovariance"](twist=twist_message, covariance=velocity_covariance),
     )
 
 
 def _select_pose(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
-    """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis."""
+    """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis.
+
+    Both are 0 on an axis that no state is on.
+    """
     numbers = [0.0 if state is None else float(mean[state]) for state in places]
-    bound = np.zeros((6, 6))
+    covariance_of_axes = np.zeros((6, 6))
     pairs = [(axis, state) for axis, state in enumerate(places) if state is not None]
     if covariance is None:
-        bound[0, 0] = UNKNOWN
+        covariance_of_axes[0, 0] = UNKNOWN
     elif pairs:
         axes, states = np.array(pairs).T
-        bound[np.ix_(axes, axes)] = covariance[np.ix_(states, states)]
-    return numbers, bound.ravel()
+        covariance_of_axes[np.ix_(axes, axes)] = covariance[np.ix_(states, states)]
+    return numbers, covariance_of_axes.ravel()
 
 
 def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:

@@ -22,13 +22,16 @@ ByFilter = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by n
 
 
 def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | None = None) -> dict[str, np.ndarray]:
-    """Return the columns of the estimates with rows of forecasts below them, in which `forecast` is true.
+    """Return the columns of the estimates, with rows of forecasts below the rows of data.
 
-    What each sensor would measure stands in the columns forecast.OUTPUT and forecast.OUTPUT.sd, named after node and
-    filter as the states are; NaN in rows of data. What was `predicted` of those is NaN in rows of forecasts.
+    The column `forecast` is true in the rows of forecasts. What each sensor would measure then stands in the columns
+    forecast.OUTPUT and forecast.OUTPUT.sd, with node and filter in their names where the states have them there; these
+    are NaN in rows of data. What was `predicted` of rows of data is NaN in rows of forecasts.
     """
     # All forecasts have the same times.
     times = next(forecast for filters in forecasts.values() for forecast in filters.values()).time
+    rows = len(record.time)
+    # The states that are forecast, as if they were estimates of a record of their own.
     estimates = {
         node: {name: Estimate(f.states.mean, f.states.covariance, f.states.claim) for name, f in filters.items()}
         for node, filters in forecasts.items()
@@ -36,14 +39,15 @@ def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | 
     above = estimate_columns(record, predicted)
     below = estimate_columns(replace(record, time=times, truth=None, estimates=estimates, smoothed=None))
     columns = {name: _append_rows(values, below.get(name), len(times)) for name, values in above.items()}
-    is_forecast = np.arange(len(record.time) + len(times)) >= len(record.time)
+    is_forecast = np.arange(rows + len(times)) >= rows
     columns = {"time": columns.pop("time"), FORECAST: is_forecast, **columns}
     # Node and filter are part of a name where there are several of them.
-    several = len(forecasts) > 1, any(len(filters) > 1 for filters in forecasts.values())
+    has_several_nodes = len(forecasts) > 1
+    has_several_filters = any(len(filters) > 1 for filters in forecasts.values())
     for node, filters in forecasts.items():
         for name, forecast in filters.items():
-            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
-            columns |= _make_output_columns(f"{prefix}{FORECAST}.", forecast, len(record.time))
+            prefix = (f"{node}." if has_several_nodes else "") + (f"{name}." if has_several_filters else "")
+            columns |= _make_output_columns(f"{prefix}{FORECAST}.", forecast, rows)
     return columns
 
 

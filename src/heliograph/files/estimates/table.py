@@ -71,29 +71,31 @@ def make_header(name: str, unit: str | None) -> str:
 
 def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
     """Return the columns that show an estimate: means, standard deviations and covariances as claimed, and validity."""
-    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []
     for i, state in enumerate(states):
         columns.append((make_header(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
-            variance = bound[:, i, i]
-            columns.append(
-                (make_header(f"{state}.sd", units.get(state)), np.sqrt(np.where(variance >= 0, variance, np.nan)))
-            )
-    # Attitudes as unit quaternions too.
-    for i in range(0, len(estimate.attitude), 3):
-        quaternions = quaternion_of(mean[:, list(estimate.attitude[i : i + 3])])
-        columns += [(f"{states[estimate.attitude[i]]}.q{part}", quaternions[:, j]) for j, part in enumerate("wxyz")]
+            # Rounding may make a variance negative: its deviation is NaN.
+            variance = covariance[:, i, i]
+            deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
+            columns.append((make_header(f"{state}.sd", units.get(state)), deviation))
+    # Each attitude is three states, a rotation vector: as a unit quaternion too, named after the first of them.
+    for k in range(0, len(estimate.attitude), 3):
+        axes = estimate.attitude[k : k + 3]
+        quaternions = quaternion_of(mean[:, list(axes)])
+        columns += [(f"{states[axes[0]]}.q{part}", quaternions[:, j]) for j, part in enumerate("wxyz")]
     # Covariances of two states have the product of their units.
     if estimate.claim != "none":
-        for i, a in enumerate(states):
-            for j in range(i + 1, len(states)):
-                of = " ".join(units[name] for name in (a, states[j]) if name in units)
-                columns.append((make_header(f"cov.{a}.{states[j]}", of), bound[:, i, j]))
+        for i, first in enumerate(states):
+            for j, second in enumerate(states[i + 1 :], i + 1):
+                unit = " ".join(units[name] for name in (first, second) if name in units)
+                columns.append((make_header(f"cov.{first}.{second}", unit), covariance[:, i, j]))
+    # Probabilities of the modes of a Markov chain, (rows, modes).
     if estimate.modes is not None:
-        columns += [(f"mode.{i}", values) for i, values in enumerate(np.asarray(estimate.modes).T)]
+        columns += [(f"mode.{m}", values) for m, values in enumerate(np.asarray(estimate.modes).T)]
     return [*columns, ("valid", is_sound(estimate))]
 
 
