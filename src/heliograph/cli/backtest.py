@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from heliograph.files.recording import Recording
+    from heliograph.forecasting import Score
     from heliograph.report.progress import Advance
     from heliograph.report.results import Results
     from heliograph.simulation.network import Network
@@ -49,17 +50,11 @@ def backtest(
     """
     from heliograph.disk.quoting import visible
     from heliograph.numerics.check import check_count, fail
-    from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.results import write_results
 
     # Check the options before anything is computed.
     target = choose_results_folder("backtest", out, NAME) / NAME
-    # One number, or a list in which spans of time and dates may stand too: a backtest takes numbers of rows only.
-    asked = horizons_in(horizons)
-    listed = [asked] if isinstance(asked, int) else asked
-    rows_ahead = [horizon for horizon in listed if isinstance(horizon, int)]
-    if len(rows_ahead) < len(listed):
-        raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
+    rows_ahead = _parse_rows_ahead(horizons)
     check_count("--refit", refit, 0)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
@@ -73,16 +68,10 @@ def backtest(
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
         z, u, time, truth = data.recording
+        fit_to_first = _make_refit(network, data.recording, advance) if refit else None
+        # Without a refit `every` is not used.
         return heliograph.backtest(
-            loaded,
-            measurements=z,
-            horizons=rows_ahead,
-            inputs=u,
-            time=time,
-            truth=truth,
-            skip=skip,
-            refit=_make_refit(network, data.recording, advance) if refit else None,
-            every=refit or 1,  # not used without a refit
+            loaded, z, rows_ahead, inputs=u, time=time, truth=truth, skip=skip, refit=fit_to_first, every=refit or 1
         )
 
     def make_results(found: "heliograph.forecasting.Backtest") -> "Results":
@@ -93,10 +82,30 @@ def backtest(
 
     found = write_results(target, STAGES_WITH_REFIT if refit else STAGES, compute, make_results)
     for score in found.scores:
-        shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
-        print(visible(f"{score.node}/{score.filter} {score.part} {score.name}, {score.horizon} ahead: within the "
-                      f"intervals of 50, 80, 95 %: {shares}"))  # fmt: skip
+        print(visible(_describe_coverage(score)))
     print(visible(str(target / "report.html")))
+
+
+def _parse_rows_ahead(horizons: str) -> list[int]:
+    """Return the horizons of the option, which have to be numbers of rows; raise ValueError at a span or a date."""
+    from heliograph.numerics.check import fail
+    from heliograph.numerics.times.dates import horizons_in
+
+    asked = horizons_in(horizons)  # one number, or a list
+    listed = [asked] if isinstance(asked, int) else asked
+    rows_ahead = [horizon for horizon in listed if isinstance(horizon, int)]
+    if len(rows_ahead) < len(listed):
+        raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
+    return rows_ahead
+
+
+def _describe_coverage(score: "Score") -> str:
+    """Return a line on how often what came was within the intervals of a forecast."""
+    shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
+    return (
+        f"{score.node}/{score.filter} {score.part} {score.name}, {score.horizon} ahead: within the "
+        f"intervals of 50, 80, 95 %: {shares}"
+    )
 
 
 def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":

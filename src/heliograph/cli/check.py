@@ -58,13 +58,13 @@ def check(
     if figure is not None and not options.asked:
         raise fail("--figure", "what sensors are worth (--without, --outage or --with)", "none of these")
     worth = compute_worth(loaded, module, options) if options.asked else None
-    # The diagram, then a line for each doubt.
+    # The diagram, then a line for each doubt, of which only the serious ones count.
     print("\n".join(map(visible, loaded.diagram().splitlines())))
-    lines = doubts_before_data(loaded)
+    doubts = doubts_before_data(loaded)
     print()
-    for line in lines:
-        print(visible(f"{'doubtful' if line.serious else 'note'}: {line.words}"))
-    serious = sum(line.serious for line in lines)
+    for doubt in doubts:
+        print(visible(f"{'doubtful' if doubt.serious else 'note'}: {doubt.words}"))
+    serious = sum(doubt.serious for doubt in doubts)
     print(f"{serious} doubtful" if serious else "nothing doubtful")
     if worth is not None:
         print()

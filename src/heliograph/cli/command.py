@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run_command(arguments: Sequence[str] | None) -> int:
     """Parse the arguments and run their command; return the exit status. What a user can mend is one line on stderr."""
-    with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
+    with suppress(ValueError):  # where the user's home cannot be written to everything is compiled again
         keep_compilations()
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
@@ -85,6 +85,7 @@ def _run_command(arguments: Sequence[str] | None) -> int:
             raise
         return _refuse(str(error))
     except OSError as error:
+        # What has no name of a file is the standard output, if that cannot be written to.
         place = error.filename
         if not place and (error.errno in FULL or _output_is_lost()):
             place = "standard output"

@@ -56,7 +56,7 @@ def count_stages(file: "DesignFile") -> int:
 
 
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
-    """Compute the design, the front around it, the value of changes, and the map."""
+    """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
     import heliograph as hg
     from heliograph.files.design_file import write_designed_source
     from heliograph.planning.comparisons import totals_about
@@ -67,7 +67,7 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     best = hg.design(file.problem)
     before = hg.power(file.network, best.problem.criterion.horizon).mean
     # Further results, each with its own progress.
-    places, totals = file.map, file.front or totals_about(best.total)
+    sites, totals = file.map, file.front or totals_about(best.total)
     return DesignResults(
         reference=file.reference,
         source=file.source,
@@ -75,6 +75,6 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
         before={name: before.get(name, float("nan")) for name in best.powers},
         front=hg.planning.error_over_power(file.problem, totals, advance),
         changes=hg.planning.worth_of_changes(best, file.exponent, advance),
-        map=None if places is None else hg.planning.error_over_sites(best, places.build, places.x, places.y, advance),
+        map=None if sites is None else hg.planning.error_over_sites(best, sites.build, sites.x, sites.y, advance),
         written=write_designed_source(file, SOURCE, best.powers),
     )

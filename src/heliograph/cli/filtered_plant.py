@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     Horizons = int | list[float | np.timedelta64 | np.datetime64]
 
 
+LEAST_CAPACITY = 1000  # of a replay, in rows
+
+
 class FilteredPlant(NamedTuple):
     """What was measured of a plant, and what its filters made of it.
 
@@ -51,22 +54,25 @@ def filter_plant(
     network: "Network",
     data: MeasuredPlant,
     smooth: "FixedInterval | FixedLag | None",
-    ahead: "Horizons | None",
+    horizons: "Horizons | None",
     predicts: bool,
 ) -> FilteredPlant:
-    """Filter a plant's rows; forecast as far `ahead`, and predict each row, where that is asked for."""
+    """Filter a plant's rows, and smooth them, forecast behind them and predict each of them where that is asked for.
 
+    `horizons`: how far ahead to forecast; None for no forecasts.
+    """
     record, doubts = filter_rows(network, data.recording, smooth)
+    # Times of dated messages count from a date, in seconds.
     if data.events is not None and data.events.dated and record.origin is not None:
         record = record.with_units({"time": "s"} | record.units)
     said = [*_describe_doubted(network, record), *data.summary]
     forecasts: ByFilter = {}
-    if ahead is not None:
-        forecasts = _make_forecasts(record, ahead)
+    if horizons is not None:
+        forecasts = _make_forecasts(record, horizons)
         said.append(_describe_forecasts(forecasts))
     return FilteredPlant(
-        data,
-        record,
+        data=data,
+        record=record,
         written=_select_rows(record, data.rows),
         forecasts=forecasts,
         predicted=heliograph.forecasting.predict_record(record, data.recording.inputs) if predicts else {},
@@ -121,7 +127,10 @@ def _describe_doubted(network: "Network", record: "Record") -> list[str]:
 
 
 def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
-    """Return some of the rows of a record, and of what is smoothed, whose rows are its last ones; `rows`: a mask."""
+    """Return some of the rows of a record, and of its smoothed estimates, which are of its last rows.
+
+    `rows`: a mask, (rows,); None for all. What is said of all rows together, as of weighing and uplinks, is left out.
+    """
     from dataclasses import replace
 
     import numpy as np
@@ -211,7 +220,10 @@ def _write_lagged_estimates(
     place: Path | StoreAddress,
     write: "Write",
 ) -> list[str]:
-    """Write the estimates of a lag later beside the others, and return a line on it; none without a lag."""
+    """Write the estimates of each row given all that came up to a lag after it, in a file or table of their own.
+
+    Return a line on it; none where no lag is asked for, or no row has waited as long.
+    """
     if lag is None or data.events is None:
         return []
     from heliograph.live.recorded import replay_events
@@ -219,17 +231,17 @@ def _write_lagged_estimates(
 
     window, ahead = options.limits
     start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
-    capacity = max(1000, len(data.events))
-    played = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
-    if played is None:
+    capacity = max(LEAST_CAPACITY, len(data.events))  # with less room than rows the oldest become final early
+    lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
+    if lagged is None:
         return []
     beside: Path | StoreAddress
     if isinstance(place, Path):
         beside = place.with_suffix(f".lagged{place.suffix}")
     else:
         beside = place.named(f"{place.written_table}_lagged")
-    write(played, beside)
-    return [f"{beside}: {len(played.time)} rows, each given what came {lag:g} later"]
+    write(lagged, beside)
+    return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
 
 
 def _choose_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":

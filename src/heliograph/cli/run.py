@@ -11,11 +11,11 @@ import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
 from heliograph.cli.filtered_blocks import WrittenRows, run_in_blocks
 from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
-from heliograph.cli.reading import ReadingOptions, read_measured
+from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
@@ -80,15 +80,10 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        # A long table is filtered in blocks, which says what it wrote; anything else is read as a whole.
-        said_of_blocks = None
+        said_of_blocks = None  # lines on a long table, which is filtered in blocks; None where all is read as a whole
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
-        measured = []
-        if said_of_blocks is None:
-            measured = read_measured(measurements, network, loaded, module, options, advance)
-        if lag is not None and measured[0].events is None:
-            raise fail("--lag", "messages or events", f"rows of time in {measurements}")
+        measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)
         # Each plant by itself, with the place where its estimates were written.
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:
@@ -105,6 +100,24 @@ def run(
     lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
+
+
+def _read_plants(
+    measurements: Path | StoreAddress,
+    reference: str,
+    network: "Network",
+    module: "Mapping[str, object]",
+    lag: float | None,
+    options: ReadingOptions,
+    advance: "Advance",
+) -> list[MeasuredPlant]:
+    """Return what was measured of each plant; raise ValueError if a lag is asked for of rows of time."""
+    from heliograph.numerics.check import fail
+
+    measured = read_measured(measurements, reference, network, module, options, advance)
+    if lag is not None and measured[0].events is None:
+        raise fail("--lag", "messages or events", f"rows of time in {measurements}")
+    return measured
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
@@ -192,10 +205,13 @@ def _check_output_places(
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results import NEEDS
 
-    kinds = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
-    needs = [package for kind in kinds & PACKAGES.keys() for package in PACKAGES[kind]]
-    needs += [*(["rosbags"] if kinds & BAGS else []), *(["pyarrow"] if ".parquet" in kinds else [])]
-    check_installed([*needs, *(NEEDS if report is not None else ())])
+    endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
+    needed = [package for ending in endings & PACKAGES.keys() for package in PACKAGES[ending]]
+    if endings & BAGS:
+        needed.append("rosbags")
+    if ".parquet" in endings:
+        needed.append("pyarrow")
+    check_installed([*needed, *(NEEDS if report is not None else ())])
     if isinstance(out, StoreAddress):
         from heliograph.files.stores.tables import check_store
 

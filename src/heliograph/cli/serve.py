@@ -79,15 +79,15 @@ class ServeOptions:
         from heliograph.serving.settings import ServiceSettings, choose_store, name_of_network, settings_of_node
         from heliograph.serving.thresholds import parse_threshold
 
+        # Addresses are checked before the network is loaded.
         broker = None if self.broker is None else parse_address(self.broker)
-        options = Options(self.window, self.ahead, self.leap)
         store = choose_store(reference, self.store, self.parts, self.node)
         network, module = load_module(reference)
         settings = ServiceSettings(
-            network,
-            options,
-            store,
-            self.process,
+            network=network,
+            options=Options(window=self.window, ahead=self.ahead, leap=self.leap),
+            store=store,
+            process=self.process,
             snapshot=self.from_snapshot,
             broker=broker,
             parts=self.parts,

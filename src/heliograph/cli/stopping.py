@@ -22,19 +22,19 @@ SOON = 0.01  # seconds
 def stoppable(stopped: list[int]) -> Iterator[None]:
     """Let SIGINT and SIGTERM unwind the running code, so that no temporary file is left; record each in `stopped`.
 
-    An interrupt that arrives in a callback of the compiler, or in a destructor, is swallowed there: it is raised again
-    by a timer.
+    An exception that is raised in a callback of the compiler, or in a destructor, does not get out of it: Python only
+    reports it. An interrupt that ends so is raised again by a timer.
     """
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:
-        """Record a signal, and raise what nobody takes for an error."""
+        """Record a signal, and raise what `except Exception` does not catch."""
         stopped.append(number)
         raise KeyboardInterrupt
 
     def interrupt_later(what: "sys.UnraisableHookArgs") -> None:
-        """Raise an interrupt that Python can only report again, a little later; report all else as before."""
+        """Raise an interrupt that was swallowed once more, a little later; report all else as before."""
         if issubclass(what.exc_type, KeyboardInterrupt):
-            timer = Timer(SOON, interrupt_main)  # raised here, it would be swallowed once more
+            timer = Timer(SOON, interrupt_main)  # raised at once, it would be swallowed again
             timer.daemon = True
             timers.append(timer)
             timer.start()

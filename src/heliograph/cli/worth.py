@@ -64,13 +64,14 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
         if not name or not (count.isascii() and count.isdecimal()):
             raise fail("--outage", "NODE:STEPS, such as gnss:60", repr(word))
         outages[name] = int(count)
-    names = list(network.nodes) if EACH in options.without and EACH not in network.nodes else list(options.without)
+    # "each" is all nodes, one after another, unless a node has that name.
+    is_each = EACH in options.without and EACH not in network.nodes
     if options.figure is not None:
         _check_figure(options.figure)
     worth: SensorWorth = hg.planning.worth_of_sensors(
         network,
         options.steps,
-        names,
+        list(network.nodes) if is_each else list(options.without),
         outages,
         _find_nodes(module, options.added),
         runs=options.runs,
