@@ -47,14 +47,21 @@ def read_parquet_blocks(
 
 
 def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, first: int) -> Rows:
-    """Return the rows of a table of Arrow; `first` is the number of its first one."""
+    """Return the rows of a table of Arrow as numbers and dates; an empty cell is NaN or NaT.
+
+    Args:
+        table: the table, or a part of one.
+        path: its file, for errors.
+        only: the columns that are read; None for all.
+        first: number of its first row.
+    """
     import pyarrow as pa
 
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if only is not None and name not in only:
             continue
-        # Timestamps keep their nanoseconds; other temporal types and nested ones are refused.
+        # Dates, integers (which may be too large for float64), and other numbers; anything else is refused.
         kind = column.type
         if pa.types.is_timestamp(kind):
             moments = np.array(column.cast(pa.timestamp(kind.unit)).to_numpy(), dtype=f"datetime64[{kind.unit}]")
@@ -67,7 +74,8 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
         if pa.types.is_integer(kind) and not column.null_count:
             columns[name] = numbers_of(column.to_numpy())
             continue
-        if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
+        is_number = pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)
+        if not (is_number or pa.types.is_null(kind)):
             raise fail(f"{path}, row {first}, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
         columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
     return Rows(columns, np.arange(first, first + table.num_rows), [])

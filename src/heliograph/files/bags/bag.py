@@ -71,12 +71,12 @@ def read_bag(
         ValueError: no bag, fields that are not in it, or no topic of the sources; one line.
         ModuleNotFoundError: rosbags is not installed (extra "bags").
     """
-    with open_bag(path) as (reader, cut):
-        events.broken = cut
+    with open_bag(path) as (reader, cut_off):
+        events.broken = cut_off
         counts = Counter[str]()  # messages by topic
         for connection in reader.connections:
             counts[connection.topic] += connection.msgcount
-        if cut and not counts:
+        if cut_off and not counts:
             raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
         used = [topic for topic in counts if sources.of(topic)]
         if not used:
@@ -161,23 +161,21 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
     messages = read_messages_in_order(reader, connections) if connections else iter(())
-    types = dict[str, str]()  # of each topic the type that it has first, and keeps
-    count, last = 0, 0
+    types = dict[str, str]()  # of each topic the type of its first message, which all others have to have
+    count, last_logged = 0, 0
     while True:
         try:
             message = next(messages)
         except StopIteration:
             return
         except Exception as error:  # whatever damage makes a reader do
-            after = (
-                f"after message {count} of its topics, logged at {format_moment(last)}"
-                if count
-                else "before any message"
-            )
-            raise DamageError(str(fail(f"{path}, {after}", "a bag without damage", _format_reason(error)))) from None
-        topic, kind, last = message.connection.topic, message.connection.msgtype, message.logged
+            place = "before any message"
+            if count:
+                place = f"after message {count} of its topics, logged at {format_moment(last_logged)}"
+            raise DamageError(str(fail(f"{path}, {place}", "a bag without damage", _format_reason(error)))) from None
+        topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
         if types.setdefault(topic, kind) != kind:
-            where = f"{path}, {topic}, logged at {format_moment(last)}"
+            where = f"{path}, {topic}, logged at {format_moment(last_logged)}"
             raise DamageError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
         yield message
         count += 1

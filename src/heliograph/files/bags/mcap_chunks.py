@@ -79,13 +79,14 @@ def _read_chunk(
     """
     from rosbags.rosbag2.storage_mcap import decompress
 
-    # A chunk's content: CRC bytes, a checksum, FIXED bytes in all and the name of the compression, then its messages,
-    # whose checksum `decompress` compares.
-    stream, first = storage.bio, chunk.chunk_start_offset + LENGTH
-    assert stream is not None
-    stream.seek(first + CRC)
+    # A chunk is a record itself: LENGTH bytes of kind and length, then its content. CRC bytes into that stands a
+    # checksum of its messages, which `decompress` compares; after FIXED bytes and the name of the compression, which
+    # is among them but for its text, the messages begin.
+    stream, content_begin = storage.bio, chunk.chunk_start_offset + LENGTH
+    assert stream is not None  # since the file is open
+    stream.seek(content_begin + CRC)
     (checksum,) = CHECKSUM.unpack(stream.read(CHECKSUM.size))
-    stream.seek(first + FIXED + len(chunk.compression))
+    stream.seek(content_begin + FIXED + len(chunk.compression))
     content = decompress(stream.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, checksum)
     # Record after record: a byte for its kind, eight for its length, its content.
     begin, end = 0, len(content)

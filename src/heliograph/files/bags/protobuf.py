@@ -92,17 +92,23 @@ class Schema:
         for file in _select_fields(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
-            for number, add in ((4, schema._add_message), (5, schema._add_enum)):
+            for number, add in ((4, schema._add_message_type), (5, schema._add_enum)):
                 for content in _select_fields(file, number):
                     add(content, f"{package}." if package else "", syntax == "proto3")
         return schema
 
-    def _add_message(self, data: bytes, prefix: str, implicit: bool) -> None:
-        """Add a type of messages, and those within it."""
+    def _add_message_type(self, data: bytes, prefix: str, implicit: bool) -> None:
+        """Read the descriptor of a type of messages, and of those within it, into the tables of the schema.
+
+        Args:
+            data: the descriptor, encoded; its fields have the numbers that descriptor.proto gives them.
+            prefix: full name of what it stands in, with a dot.
+            implicit: whether an absent field has its default, as in proto3.
+        """
         name, fields = prefix + _read_text_field(data, 1), dict[int, Field]()
         for content in _select_fields(data, 2):
             found = {number: value for number, _, value in read_fields(content)}
-            # Of a oneof, or declared optional, nothing is said by an absent field; nor of a message.
+            # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
             fields[int(found[3])] = Field(
                 _decode_text(found[1]),
@@ -112,12 +118,12 @@ class Schema:
                 implicit=implicit and not has_presence,
             )
         self.messages[name] = fields
-        for number, add in ((3, self._add_message), (4, self._add_enum)):
+        for number, add in ((3, self._add_message_type), (4, self._add_enum)):
             for content in _select_fields(data, number):
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
-        """Add an enumeration."""
+        """Read the descriptor of an enumeration into the table of the schema; `implicit` says nothing of one."""
         values = [{number: value for number, _, value in read_fields(content)} for content in _select_fields(data, 2)]
         names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
         self.enums[prefix + _read_text_field(data, 1)] = names

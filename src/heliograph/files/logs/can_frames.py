@@ -34,7 +34,7 @@ def open_frames(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
     kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
     bits = {m.name: {s.name: s.length for s in m.signals if s.scale == 1 and not s.unit} for m in database.values()}
-    return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read(), notes, bits)
+    return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read_messages(), notes, bits)
 
 
 def read_database(path: Path) -> Database:
@@ -79,7 +79,7 @@ class FrameReader:
         # Frames by identifier, and frames left out by kind.
         self._identifiers, self._left_out = Counter[str](), Counter[str]()
 
-    def read(self) -> Iterator[FileMessage | InputError]:
+    def read_messages(self) -> Iterator[FileMessage | InputError]:
         """Yield the messages in the order of the file, or why one cannot be read; then note what was left out.
 
         Raises:
@@ -177,7 +177,7 @@ class FrameReader:
 
 def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
     """Yield frames with their moments in seconds since 1970; where the file is damaged the last is an error."""
-    number = 0
+    count = 0
     with ExitStack() as stack:
         try:
             opened = _open_frames(path, stack)
@@ -185,18 +185,18 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
             raise
         except Exception as error:  # whatever a damaged file makes a reader do
             raise fail(str(path), "a log of a CAN bus", error_text(error)) from None
-        # The sources may say when the log began.
+        # Seconds from the file's times to those since 1970; the sources may say when the log began.
         shift = opened.shift if sources.start is None else sources.start - opened.begin
         frames = iter(opened.reader)
         while True:
             try:
                 frame = next(frames, None)
             except Exception as error:  # whatever a damaged file makes a reader do
-                yield CutOffError(str(fail(f"{path}, after frame {number}", "a log without damage", error_text(error))))
+                yield CutOffError(str(fail(f"{path}, after frame {count}", "a log without damage", error_text(error))))
                 return
-            if frame is None:
+            if frame is None:  # the end
                 return
-            number += 1
+            count += 1
             yield frame, round(frame.timestamp + shift, DIGITS)
 
 

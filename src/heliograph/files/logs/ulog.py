@@ -38,15 +38,15 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
             file = ULog(opened)
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a ULog file", error_text(error)) from None
-    # Of each topic the fields, which have no units, and of the wanted ones their values over time.
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
+    # The units of a topic's fields, which a ULog file does not say; of the wanted ones their values over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
         name: Series(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
         for name, data in topics.items()
         if wanted(name)
     }
-    # When the device began to run; if the sources say when the log began, from that.
+    # When the device began to run, in seconds since 1970; the sources may say when the log began, some time later.
     begin = _find_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND

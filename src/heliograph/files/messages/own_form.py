@@ -160,7 +160,7 @@ class OwnReader:
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
         sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
-        # Without an arrival it arrived when it was measured; an empty cell of a table is an error.
+        # Without an arrival it arrived when it was measured. A table has the column or not: an empty cell is an error.
         time, dated = self._read_moment(row[TIME], where, TIME)
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
@@ -172,6 +172,7 @@ class OwnReader:
         except InputError as error:
             return [(Unread(error, Reading(plant, node, sequence, time, NOTHING)), arrival)]
         events: list[tuple[Reading | Unread, Any]] = []
+        # A message of a node may bring the inputs that were set then: an event of their own.
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
             inputs = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
             events.append((Reading(plant, INPUTS, sequence, time, inputs), arrival))

@@ -176,6 +176,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
     for message in _list_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
+        # What cannot be read is counted with our own form first; at the end with whichever form was used.
         elif isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
             own.add(message, strict)
         elif events is None or sources is None:
@@ -188,7 +189,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
         if len(events):
             raise fail(str(path), "messages in our own form, or of topics", "both")
         events = own.events()
-    else:  # those that could not be read count against the topics' messages
+    else:  # all that was read is of topics, and so is what could not be
         events.refused += own.refused
         events.reasons += own.reasons
     events.broken = broken
@@ -262,8 +263,8 @@ def _append_reading(
 
     Args:
         topic: of the message.
-        message: the message, whose `content` is its payload, decoded.
-        content: this.
+        message: the message.
+        content: its payload, decoded.
         reading: what one source read in it.
         arrival: when the message arrived, in nanoseconds since 1970; None where it does not say it: when measured.
         sources: the sources.
@@ -276,6 +277,7 @@ def _append_reading(
     if arrived is None:
         what = "a time field (time=...), or a field or column 'arrival'"
         raise fail(f"{message.where}, {topic}", what, "neither")
+    # A stored message is what a broker kept for new subscribers: it arrives when they subscribe, however old it is.
     if message.stored and reading.time is None:
         sources.stored += 1
         return

@@ -55,7 +55,7 @@ def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
         ValueError: no JSON; one line.
     """
     content, doubled = _decode_json(text, name)
-    return [(item, _find_doubled(item, doubled)) for item in _flatten(content)]
+    return [(item, _name_doubled_field(item, doubled)) for item in _flatten(content)]
 
 
 def fail_of_doubled(name: str, field: str) -> InputError:
@@ -66,7 +66,7 @@ def fail_of_doubled(name: str, field: str) -> InputError:
 def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
-    `name`: of the text, for errors. A bare nan or inf is null.
+    `name`: of the text, for errors. Words such as nan or inf, which are no JSON, are null.
     """
     doubled: list[tuple[dict[str, Any], str]] = []
 
@@ -78,7 +78,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
             doubled.append((fields, next(name for name in names if names.count(name) > 1)))
         return fields
 
-    # As it is; then once more with null for bare words such as nan.
+    # First as it is, which is fast; then once more with null for words such as nan outside of texts.
     try:
         return json.loads(text, object_pairs_hook=collect), doubled
     except ValueError:
@@ -86,22 +86,25 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
     except RecursionError:
         raise fail(name, "JSON", "brackets nested too deeply") from None
     try:
-        words = text.decode() if isinstance(text, bytes) else text
-        words = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", words)
-        return json.loads(words, object_pairs_hook=collect), doubled
+        decoded = text.decode() if isinstance(text, bytes) else text
+        repaired = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", decoded)
+        return json.loads(repaired, object_pairs_hook=collect), doubled
     except (ValueError, RecursionError):  # also bytes that are no text
         raise fail(name, "JSON", show_value(text)) from None
 
 
-def _find_doubled(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
-    """Return the doubled field of `content` or of an object in it, by the objects that have one; None if none has."""
+def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
+    """Return the name of a field that `content`, or an object in it, has twice; None if there is none.
+
+    `doubled`: the objects that have one, with its name, as they were found on decoding.
+    """
     if not doubled or not isinstance(content, dict | list):
         return None
     field_of_content = next((field for fields, field in doubled if fields is content), None)
     if field_of_content is not None:
         return field_of_content
     parts = content.values() if isinstance(content, dict) else content
-    return next((field for part in parts if (field := _find_doubled(part, doubled)) is not None), None)
+    return next((field for part in parts if (field := _name_doubled_field(part, doubled)) is not None), None)
 
 
 def _flatten(content: object) -> Iterator[object]:
@@ -131,7 +134,7 @@ def field_at(message: object, path: str, where: str) -> Any:
     Raises:
         ValueError: no such field; one line with the path and the fields that are there.
     """
-    # Objects with attributes first: messages of bags, of which there are millions.
+    # A message of a bag is an object with attributes, and there are millions: all of the path at once, if it has them.
     if path and not isinstance(message, PLAIN):
         with suppress(AttributeError):
             return _getter(path)(message)
