@@ -18,7 +18,7 @@ def interruptible():
 def test_a_second_signal_of_another_kind_leaves_the_exit_code_of_the_first():
     """Noted, then unwinding: SIGTERM and then SIGINT is 143, as SIGTERM alone."""
     with cli.GentleStop() as stop:
-        stop.begin()
+        stop.only_note_next()
         signal.raise_signal(signal.SIGTERM)
         assert stop.code == cli.TERMINATED
         with pytest.raises(KeyboardInterrupt):

@@ -160,7 +160,7 @@ def test_a_word_is_kept_over_a_restart(network, tmp_path):
 
     def begun():
         translator = Translator(table(here[0]) | {"other/+": table(here[1:])["zigbee2mqtt/+"]}, network)
-        return translator, LastWordsService(Silent(), translator.sources.words, store)
+        return translator, LastWordsService(Silent(), translator.sources.device_statuses, store)
 
     identity = {"states": "temperature", "description": "{}"}
     value = b'{"temperature": 1}'

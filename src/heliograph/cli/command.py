@@ -77,27 +77,27 @@ def _run_command(arguments: Sequence[str] | None) -> int:
         sys.stdout.flush()
         return code or 0
     except CycloptsError as error:
-        return _refuse(str(error))
+        return _print_refusal(str(error))
     except ValueError as error:
         from heliograph.numerics.check import InputError
 
         if not isinstance(error, InputError):
             raise
-        return _refuse(str(error))
+        return _print_refusal(str(error))
     except OSError as error:
         # What has no name of a file is the standard output, if that cannot be written to.
         place = error.filename
         if not place and (error.errno in FULL or _output_is_lost()):
             place = "standard output"
-        return _refuse(f"{place}: {error.strerror or error}" if place else str(error))
+        return _print_refusal(f"{place}: {error.strerror or error}" if place else str(error))
     except MissingPackagesError as error:
-        return _refuse(str(error))
+        return _print_refusal(str(error))
     except ModuleNotFoundError as error:
         # A missing package of an extra: say how to install it.
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        return _refuse(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
+        return _print_refusal(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
 
 
 @contextmanager
@@ -131,7 +131,7 @@ def _output_is_lost() -> bool:
     return False
 
 
-def _refuse(message: str) -> int:
+def _print_refusal(message: str) -> int:
     """Print an error as one line, and return the exit status of bad input."""
 
     from heliograph.disk.quoting import visible

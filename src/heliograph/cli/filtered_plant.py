@@ -222,7 +222,7 @@ def _write_lagged_estimates(
 ) -> list[str]:
     """Write the estimates of each row given all that came up to a lag after it, in a file or table of their own.
 
-    Return a line on it; none where no lag is asked for, or no row has waited as long.
+    Return a line on it; none without a lag, and of rows of time.
     """
     if lag is None or data.events is None:
         return []

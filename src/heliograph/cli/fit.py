@@ -214,8 +214,8 @@ def _fit_with_progress(
 
     def show_progress(line: str) -> None:
         """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
-        stop.check()
-        stop.begin()  # from here on there is a best so far, which the next signal keeps
+        stop.raise_if_requested()
+        stop.only_note_next()  # from here on there is a best so far, which the next signal keeps
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)

@@ -53,7 +53,7 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
 
 
 class GentleStop:
-    """A stop that keeps what there is: from `begin` on the first signal is only noted, and a second one unwinds.
+    """A stop that keeps what there is: after `only_note_next` a first signal is only noted, and a second one unwinds.
 
     The exit code is that of the first: a second may be the interrupt that `stoppable` raises again where the first was
     swallowed. As a context it gives the signals back at its end.
@@ -61,7 +61,7 @@ class GentleStop:
 
     def __init__(self) -> None:
         self._number = 0  # of the first signal; 0 for none
-        self._handlers: dict[int, object] = {}  # of each signal before `begin`, to be put back
+        self._handlers: dict[int, object] = {}  # of each signal before `only_note_next`, to be put back
 
     def __enter__(self) -> "GentleStop":
         return self
@@ -79,15 +79,15 @@ class GentleStop:
         """Return the command's exit code: 0, or the one that says which signal stopped it."""
         return SIGNALLED + self._number if self._number else 0
 
-    def begin(self) -> None:
+    def only_note_next(self) -> None:
         """Only note the next signal."""
         if not self._handlers and not self._number:
             self._handlers = {number: signal.getsignal(number) for number in STOPPING}
             for number, handler in self._handlers.items():
                 if handler is not signal.SIG_IGN:
-                    signal.signal(number, self._note)
+                    signal.signal(number, self._note_signal)
 
-    def check(self) -> None:
+    def raise_if_requested(self) -> None:
         """Raise KeyboardInterrupt if a signal came."""
         if self._number:
             raise KeyboardInterrupt
@@ -110,13 +110,13 @@ class GentleStop:
         self._number = self._number or number
         raise KeyboardInterrupt
 
-    def _note(self, number: int, _: FrameType | None) -> None:
+    def _note_signal(self, number: int, _: FrameType | None) -> None:
         """Note a signal; the next one has its effect of before."""
         self._number = self._number or number
         self._restore_handlers()
 
     def _restore_handlers(self) -> None:
-        """Give signals the handlers back that they had before `begin`."""
+        """Give signals the handlers back that they had before `only_note_next`."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._handlers = {}

@@ -214,12 +214,12 @@ def print_list(kind: str) -> None:
 
 def first_line(module: str) -> str:
     """Return the first line of a module's docstring, without running the module."""
-    return (ast.get_docstring(parse(module)) or "").partition("\n")[0]
+    return (ast.get_docstring(parse_source(module)) or "").partition("\n")[0]
 
 
 def read_needed_packages(module: str) -> Sequence[str]:
     """Return the packages of extras that a study's module lists as `NEEDS`, without running it: it may need them."""
-    for statement in parse(module).body:
+    for statement in parse_source(module).body:
         match statement:
             case ast.Assign(targets=[ast.Name(id="NEEDS")], value=value):
                 needs: Sequence[str] = ast.literal_eval(value)
@@ -227,7 +227,7 @@ def read_needed_packages(module: str) -> Sequence[str]:
     return ()
 
 
-def parse(module: str) -> ast.Module:
+def parse_source(module: str) -> ast.Module:
     """Return the source of a module as a tree, without running it; an empty one where there is no source."""
     spec = find_spec(module)
     if spec is None or spec.origin is None:

@@ -99,7 +99,7 @@ class DeviceStatuses:
         """Return the topics, wildcards included, on which no device has said a word."""
         return [topic for topic, several in self._by_pattern.items() if not self._heard.intersection(several)]
 
-    def about(self, topic: str) -> list[Available]:
+    def find_conditions(self, topic: str) -> list[Available]:
         """Return the conditions for which a message of this topic is a device's word."""
         matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
@@ -115,28 +115,28 @@ class DeviceStatuses:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        conditions = self.about(topic)
+        conditions = self.find_conditions(topic)
         if not conditions:
             return False
-        said, before = _decode_payload(payload, where), self._number(topic)
+        said, before = _decode_payload(payload, where), self._number_words(topic)
         for condition in conditions:
-            self._note(condition, topic, offline=said != "" and condition.says_offline(said, where))
-        if self._number(topic) != before:
+            self._note_word(condition, topic, offline=said != "" and condition.says_offline(said, where))
+        if self._number_words(topic) != before:
             self._changed.add(topic)
         return True
 
-    def changed(self) -> dict[str, int]:
+    def take_changed_words(self) -> dict[str, int]:
         """Return {topic: its words as a number, as `restore` takes it} of the words changed since the last call."""
         changed, self._changed = self._changed, set()
-        return {topic: self._number(topic) for topic in changed}
+        return {topic: self._number_words(topic) for topic in changed}
 
     def restore(self, words: Mapping[str, int]) -> None:
-        """Take last words that were kept, as `changed` gives them: bit i is 1 if a topic's condition i says offline."""
+        """Take last words that were kept: of each topic its words as a number, as `take_changed_words` gives them."""
         for topic, bits in words.items():
-            for i, condition in enumerate(self.about(topic)):
-                self._note(condition, topic, offline=bool((bits >> i) & 1))
+            for i, condition in enumerate(self.find_conditions(topic)):
+                self._note_word(condition, topic, offline=bool((bits >> i) & 1))
 
-    def _note(self, condition: Available, topic: str, offline: bool) -> None:
+    def _note_word(self, condition: Available, topic: str, offline: bool) -> None:
         """Note the word of a topic for a condition."""
         self._heard.add(condition)
         if offline:
@@ -144,11 +144,12 @@ class DeviceStatuses:
         else:
             self._offline.discard((condition, topic))
 
-    def _number(self, topic: str) -> int:
+    def _number_words(self, topic: str) -> int:
         """Return the words of a topic as a number: bit i is 1 if its i-th condition says offline."""
-        return sum(1 << i for i, condition in enumerate(self.about(topic)) if (condition, topic) in self._offline)
+        conditions = self.find_conditions(topic)
+        return sum(1 << i for i, condition in enumerate(conditions) if (condition, topic) in self._offline)
 
-    def offline(self, condition: Available, topic: str) -> bool:
+    def is_offline(self, condition: Available, topic: str) -> bool:
         """Return whether the device of a topic of values has said that it is offline."""
         return bool(self._offline) and (condition, condition.of(topic)) in self._offline
 

@@ -42,7 +42,7 @@ class BlockOrder:
         self._jump: RowsAsColumns | None = None  # two rows between which is more than a year
         self._left_out = list[RowsAsColumns]()  # of each block those with the least and the greatest time
 
-    def add(self, came: RowsAsColumns, ordered: RowsAsColumns) -> None:
+    def check_block(self, came: RowsAsColumns, ordered: RowsAsColumns) -> None:
         """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
 
         Args:
@@ -55,9 +55,9 @@ class BlockOrder:
         if self.last is not None and self.last.time.dtype != ordered.time.dtype:
             where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
-        rows = ordered if self.last is None else _append(self.last, ordered)
+        rows = ordered if self.last is None else _join_times(self.last, ordered)
         if (row := find_backwards_row(rows.time)) is not None:
-            raise self._refuse(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
+            raise self._make_refusal(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
         self.last = ordered.of(slice(-1, None))
         if self._first is None:
             self._first = ordered.of(slice(1))
@@ -65,18 +65,18 @@ class BlockOrder:
             return
         # A step of more than a year, and rows out of order, in whichever blocks: the rows behind the step may all have
         # stamps that were not set, which a block cannot tell.
-        if len(jumps := np.flatnonzero(np.diff(rows.time) > _year(rows.time))):
+        if len(jumps := np.flatnonzero(np.diff(rows.time) > _year_in_unit_of(rows.time))):
             self._jump = rows.of(slice(int(jumps[0]), int(jumps[0]) + 2))
         if (row := find_backwards_row(came.time)) is not None:
             self._disordered = came.of(slice(row - 1, row + 1))
         if self._jump is not None and self._disordered is not None:
-            raise self._refuse(self._disordered, "times in order, in a recording with steps of more than a year")
+            raise self._make_refusal(self._disordered, "times in order, in a recording with steps of more than a year")
         # What the block left out is compared with all rows at the end: its earliest and its latest stand for it.
         left_out = came.of(~np.isin(came.numbers, ordered.numbers))
         if len(left_out.numbers):
             self._left_out.append(left_out.of(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
-    def end(self) -> None:
+    def check_left_out(self) -> None:
         """Check that all rows that blocks left out are more than a year outside of all that stay.
 
         Raises:
@@ -85,24 +85,24 @@ class BlockOrder:
         if self._first is None or self.last is None:
             return
         first, last = self._first.time[0], self.last.time[0]
-        year = _year(self._first.time)
+        year = _year_in_unit_of(self._first.time)
         for rows in self._left_out:
             for row in range(2):
                 if first - year <= rows.time[row] <= last + year:
-                    raise self._refuse(_append(self.last, rows.of(slice(row, row + 1))), "times in order")
+                    raise self._make_refusal(_join_times(self.last, rows.of(slice(row, row + 1))), "times in order")
 
-    def _refuse(self, rows: RowsAsColumns, expected: str) -> RowsNotInBlocksError:
+    def _make_refusal(self, rows: RowsAsColumns, expected: str) -> RowsNotInBlocksError:
         """Return the error that names the second of two rows."""
         where = f"{self._path}, row {rows.numbers[1]}, column {TIME!r}"
         return RowsNotInBlocksError(str(fail(where, expected, backwards_text(rows.time, 1))))
 
 
-def _append(before: RowsAsColumns, after: RowsAsColumns) -> RowsAsColumns:
+def _join_times(before: RowsAsColumns, after: RowsAsColumns) -> RowsAsColumns:
     """Return the numbers and times of rows behind others."""
     numbers, time = (np.concatenate([before[i], after[i]]) for i in range(2))
     return RowsAsColumns(numbers, time, {}, {}, {})
 
 
-def _year(time: np.ndarray) -> np.timedelta64 | float:
+def _year_in_unit_of(time: np.ndarray) -> np.timedelta64 | float:
     """Return a year in the unit of times."""
     return np.timedelta64(YEAR, "ns") if time.dtype.kind == "M" else YEAR / SECOND

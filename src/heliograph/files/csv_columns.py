@@ -80,14 +80,15 @@ class CsvColumnReader:
         Raises:
             ValueError: another header than before; where reading is strict, a row that cannot be read.
         """
-        refused, numbers = list[InputError](), list[int]()
-        texts, values = list[list[str]](), list[list[float | int]]()
+        refused = list[InputError]()
+        # Of each row that can be read: its number in the file, its cells, and these as numbers.
+        numbers, texts, values = list[int](), list[list[str]](), list[list[float | int]]()
         for row in rows:
             try:
                 if isinstance(row, InputError):
                     raise row
                 self._check_header(row)
-                values.append(self._read_numbers(row))
+                values.append(self._parse_cells(row))
             except InputError as error:
                 if self._strict:
                     raise
@@ -129,10 +130,11 @@ class CsvColumnReader:
         if row.header != self.header:
             raise fail(row.where, f"the columns {', '.join(self.header)}", ", ".join(row.header))
 
-    def _read_numbers(self, row: CsvRow) -> list[float | int]:
-        """Return the number of each cell, nanoseconds of dates, NaN or NAT of empty ones and of columns not read.
+    def _parse_cells(self, row: CsvRow) -> list[float | int]:
+        """Return a number for each cell: of a date its nanoseconds; of an empty one NaN, or NAT among dates.
 
-        The first cell of a column that is not empty says whether all are dates; of a row that is refused none does.
+        Cells of columns that are not read are NaN. The first cell of a column that is not empty decides whether all
+        are dates. A row that is refused decides nothing: what its cells say is noted only once all are read.
         """
         newly_dated = dict[str, bool]()
         numbers: list[float | int] = []
@@ -140,11 +142,11 @@ class CsvColumnReader:
             if self._only is not None and name not in self._only:
                 numbers.append(np.nan)
                 continue
-            dated = self._dated.get(name)  # None: not known yet
-            if (looks_like_date(cell) if dated is None else dated) and not self._is_missing(cell):
+            has_dates = self._dated.get(name)  # None: not decided yet
+            if (looks_like_date(cell) if has_dates is None else has_dates) and not self._is_missing(cell):
                 numbers.append(self._read_moment(row, name, cell))
                 newly_dated[name] = True
-            elif dated:
+            elif has_dates:
                 numbers.append(NAT)
             else:
                 numbers.append(parse_cell(row.where, name, cell, self.path))

@@ -335,7 +335,7 @@ class EventTable:
         events = events.of(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
-        row, times = number_rows(events.time, self.steps, self._joint)
+        row, times = number_rows(events.time, self.steps, self._are_rows_joint)
         tables = self._fill_tables(events, row, len(times))
         inputs = fill_forward(tables.pop(INPUTS))
         if not self.steps:
@@ -359,7 +359,7 @@ class EventTable:
         return tables
 
     @property
-    def _joint(self) -> bool:
+    def _are_rows_joint(self) -> bool:
         """Return whether all events of one time are one row."""
         return self.steps or self.network.common is not None
 
@@ -395,4 +395,4 @@ class EventTable:
             return np.asarray(matrices[events.node[i]][events.place[i]])
 
         limits = [limit if limit == np.inf or self._unit == 1 else round(limit * SECOND) for limit in (window, ahead)]
-        return events, judge_events(events, values, self._joint, *limits)
+        return events, judge_events(events, values, self._are_rows_joint, *limits)

@@ -72,13 +72,13 @@ class RecordingBlocks:
             ValueError: what `read_recording` refuses.
         """
         parts = read_row_blocks(self._path, self._reader.only, self._strict, self._block, self._note_progress)
-        for block in cut_recordings(self._arrange(parts), self._block.rows):
+        for block in cut_recordings(self._yield_recordings(parts), self._block.rows):
             yield block
             self.rows += len(block.time)
         if not self.rows:
             raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
 
-    def _arrange(self, parts: Iterable[Rows]) -> Iterator[Recording]:
+    def _yield_recordings(self, parts: Iterable[Rows]) -> Iterator[Recording]:
         """Yield parts of a table as recordings, each behind the last row of the one before it."""
         order = BlockOrder(self._path, self._reader.network)
         for rows in parts:
@@ -93,13 +93,13 @@ class RecordingBlocks:
             if not len(cells.numbers):
                 continue
             before = order.last
-            order.add(came, cells)
+            order.check_block(came, cells)
             with warnings.catch_warnings(record=True) as doubts:
                 warnings.simplefilter("always", UserWarning)
                 recording = self._reader.make_recording(cells, before)
             self.doubts += [str(doubt.message) for doubt in doubts]
             yield recording
-        order.end()
+        order.check_left_out()
 
     def _note_progress(self, done: int, total: int) -> None:
         """Keep how much of the file is read, and tell it."""

@@ -39,6 +39,7 @@ def columns_of(table: object, name: str = "table", only: Container[str] | None =
         index = getattr(frame, "index", None)
         header = list(getattr(frame, "column_names", frame.columns))  # of pyarrow, whose columns are arrays
         check_distinct(name, header)
+        # Times may be the index of a DataFrame, where it is called so.
         named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in header else {}
         named |= {column: frame[column] for column in header}
     else:
@@ -138,8 +139,11 @@ def read_row_blocks(
     Raises:
         ValueError: what `read_table` refuses, but for a table without rows.
     """
-    plugin = None if kind_of(path) in FORMATS else find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
-    kind = kind_of(path) if plugin is not None or kind_of(path) in FORMATS else format_of(path)
+    # A format of our own, or one that a package of somebody else's reads; `format_of` raises at any other.
+    kind, is_ours = kind_of(path), kind_of(path) in FORMATS
+    plugin = None if is_ours else find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
+    if plugin is None and not is_ours:
+        kind = format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:

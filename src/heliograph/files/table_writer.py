@@ -99,7 +99,7 @@ def _format_cells(column: np.ndarray) -> list[str]:
     two differ: in exponents of one digit, where only one of them has an exponent at all, of NaN and of infinity.
     """
     if column.dtype.kind != "f":
-        return list(map(str, _plain(column).tolist()))
+        return list(map(str, _convert_to_plain(column).tolist()))
     values, size = column.tolist(), np.abs(column.astype(np.float64))
     text = msgspec.json.encode(values).decode().replace("]", ",")
     for digit in "6789":  # of an exponent Python writes two digits
@@ -117,7 +117,7 @@ def read_back_name(name: str) -> str:
     return unquote_cell(quote_for_cell(name).strip())
 
 
-def _plain(column: np.ndarray) -> np.ndarray:
+def _convert_to_plain(column: np.ndarray) -> np.ndarray:
     """Return dates as texts, and true and false as 1 and 0; other numbers as they are."""
     if column.dtype.kind == "M":
         return format_dates(column)

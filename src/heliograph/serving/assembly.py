@@ -225,7 +225,11 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
             service.resume()
             transport = _open_transport(settings, reader)
             # Of devices that say when they go offline the last such word is kept in the store too.
-            shown = wrap(service) if reader is None else LastWordsService(wrap(service), reader.sources.words, store)
+            shown = (
+                wrap(service)
+                if reader is None
+                else LastWordsService(wrap(service), reader.sources.device_statuses, store)
+            )
             await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:
             store.close()

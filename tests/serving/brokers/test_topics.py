@@ -219,7 +219,7 @@ def test_the_stored_word_of_a_device_holds_for_a_service_that_begins_later(serve
                 client.publish("den2mqtt/a", payload, 1)
             await until(lambda: translator.sources.offline["den2mqtt/a"] == 2)
             client.publish("den2mqtt/a/availability", b'{"state": "online"}', 1, retain=True)
-            await until(lambda: not translator.sources.words._offline)
+            await until(lambda: not translator.sources.device_statuses._offline)
             client.publish("den2mqtt/a", b'{"temperature": 18.0}', 1)
             batch = await asyncio.wait_for(read, 20)
             assert [message.values for message in batch.payloads] == [[18.0]]

@@ -79,9 +79,8 @@ def _read_chunk(
     """
     from rosbags.rosbag2.storage_mcap import decompress
 
-    # A chunk is a record itself: LENGTH bytes of kind and length, then its content. CRC bytes into that stands a
-    # checksum of its messages, which `decompress` compares; after FIXED bytes and the name of the compression, which
-    # is among them but for its text, the messages begin.
+    # A chunk is a record itself: LENGTH bytes, then its content. CRC bytes into that stands the checksum of its
+    # messages, which `decompress` compares; they begin after FIXED bytes and the name of the compression.
     stream, content_begin = storage.bio, chunk.chunk_start_offset + LENGTH
     assert stream is not None  # since the file is open
     stream.seek(content_begin + CRC)

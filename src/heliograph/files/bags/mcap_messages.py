@@ -83,7 +83,7 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
             for count, channel, logged, data, types in _yield_raw_messages(path, file, sources):
                 where = f"{path}, message {count}"
                 wanted = sources is None or bool(sources.of(channel.topic))
-                payload = _decode(where, channel, types, data) if wanted else None
+                payload = _decode_payload(where, channel, types, data) if wanted else None
                 if isinstance(payload, InputError):
                     yield payload
                 else:
@@ -133,7 +133,7 @@ def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> 
             yield _RawMessage(count, channels[number], logged, content[HEADER.size :], types)
 
 
-def _decode(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:
+def _decode_payload(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:
     """Return a message: in JSON its text, in Protocol Buffers its fields, in others None.
 
     Why it is none is returned too, not raised: the reader counts it.

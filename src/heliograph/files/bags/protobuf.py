@@ -123,7 +123,7 @@ class Schema:
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
-        """Read the descriptor of an enumeration into the table of the schema; `implicit` says nothing of one."""
+        """Read the descriptor of an enumeration into the table of the schema; `implicit`: not used of one."""
         values = [{number: value for number, _, value in read_fields(content)} for content in _select_fields(data, 2)]
         names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
         self.enums[prefix + _read_text_field(data, 1)] = names
@@ -145,13 +145,13 @@ class Schema:
         if name not in self.messages or depth > DEEPEST:
             raise ValueError(f"no type {name!r} in the schema" if depth <= DEEPEST else "messages nested too deeply")
         fields = self.messages[name]
-        content: dict[str, Any] = {f.name: [] if f.repeated else self._default(f) for f in fields.values()
+        content: dict[str, Any] = {f.name: [] if f.repeated else self._choose_default(f) for f in fields.values()
                                    if f.repeated or f.implicit}  # fmt: skip
         for number, wire, value in read_fields(data):
             field = fields.get(number)
             if field is None:  # of a newer schema
                 continue
-            values = [self._read_value(field, each, depth) for each in _unpack(field, wire, value)]
+            values = [self._read_value(field, each, depth) for each in _split_packed(field, wire, value)]
             if field.repeated:
                 content[field.name] += values
             elif values:
@@ -168,7 +168,7 @@ class Schema:
             return _decode_text(value)
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
-    def _default(self, field: Field) -> Any:
+    def _choose_default(self, field: Field) -> Any:
         """Return what an absent field stands for."""
         if field.kind == ENUM:
             return self.enums.get(field.of, {}).get(0, 0)
@@ -211,7 +211,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     raise ValueError("no message of Protocol Buffers, or one that was cut off")
 
 
-def _unpack(field: Field, wire: int, value: Wire) -> list[Wire]:
+def _split_packed(field: Field, wire: int, value: Wire) -> list[Wire]:
     """Return the values of a field as they stand: of a packed list several.
 
     Args:

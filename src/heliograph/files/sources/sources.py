@@ -79,7 +79,7 @@ class Sources:
         self._sources_of_topic = dict[str, list[MappedSource]]()
         self._fields_of_topic = dict[str, set[str]]()
         mapped = [single for several in self._table.values() for single in several]
-        self.words = DeviceStatuses(condition for single in mapped for condition in single.source.available)
+        self.device_statuses = DeviceStatuses(condition for single in mapped for condition in single.source.available)
         # Where dates are counted in steps: the seconds of one.
         step_lengths = {single.source.step for single in mapped}
         if len(step_lengths) > 1:
@@ -94,7 +94,7 @@ class Sources:
     @property
     def subscribed(self) -> list[str]:
         """Return the topics of the table, and those on which devices say whether they are online."""
-        return list(dict.fromkeys([*self._table, *self.words.topics]))
+        return list(dict.fromkeys([*self._table, *self.device_statuses.topics]))
 
     @property
     def notes(self) -> list[str]:
@@ -104,7 +104,7 @@ class Sources:
             if counts:
                 named = ", ".join(f"{topic} ({number})" for topic, number in counts.most_common(LISTED))
                 lines.append(f"messages {why}: {named}{_count_more(len(counts))}")
-        if silent := self.words.unheard:
+        if silent := self.device_statuses.unheard:
             lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_count_more(len(silent))}")
         return lines
 
@@ -160,7 +160,7 @@ class Sources:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        return self.words.take_last_word(topic, payload, where)
+        return self.device_statuses.take_last_word(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
         """Return a reading of a message for each source of its topic; [] of an unknown topic, which is counted.
@@ -247,7 +247,7 @@ class Sources:
             if field_at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
                 return True
-        if any(self.words.offline(condition, topic) for condition in source.available):
+        if any(self.device_statuses.is_offline(condition, topic) for condition in source.available):
             self.offline[topic] += 1
             return True
         return False

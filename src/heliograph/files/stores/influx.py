@@ -32,7 +32,7 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     Raises:
         ValueError: the server is away or refuses, or nothing came; one line.
     """
-    query = address.query or f'SELECT * FROM "{_escape(address.table, chr(34))}"'
+    query = address.query or f'SELECT * FROM "{_escape_name(address.table, chr(34))}"'
     match address.language:
         case "flux":
             return read_flux(address, _send_request(address, "POST", *_make_flux_request(address)))
@@ -82,8 +82,8 @@ def _batch_lines(
     table: str, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str
 ) -> Iterator[tuple[bytes, int]]:
     """Yield lines of the protocol in requests of a bounded size, each with its number of rows."""
-    key = _escape(table, ", ") + (f",plant={_escape(plant, ', =')}" if plant else "")
-    names = [_escape(name, ", =") for name in columns]
+    key = _escape_name(table, ", ") + (f",plant={_escape_name(plant, ', =')}" if plant else "")
+    names = [_escape_name(name, ", =") for name in columns]
     lines, size, rows = list[str](), 0, 0
     for time, *cells in zip(moments.astype(np.int64).tolist(), *(c.tolist() for c in columns.values()), strict=True):
         fields = ",".join(f"{n}={_print_value(v)}" for n, v in zip(names, cells, strict=True) if isfinite(v))
@@ -103,7 +103,7 @@ def _print_value(value: bool | float) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(float(value))
 
 
-def _escape(name: str, signs: str) -> str:
+def _escape_name(name: str, signs: str) -> str:
     """Return a name with a backslash before each of some signs."""
     return re.sub(f"([{re.escape(signs)}])", r"\\\1", name)
 

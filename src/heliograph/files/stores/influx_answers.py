@@ -16,7 +16,7 @@ Row = Mapping[str, Any]
 
 
 def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
-    """Return the table of an answer to InfluxQL; several series, as of GROUP BY, are one, with their tags as columns.
+    """Return the table of an answer to InfluxQL; several series, as of GROUP BY, become one, with tags as columns.
 
     Raises:
         ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
@@ -29,17 +29,19 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
     if refusal is not None:
         raise fail(str(address), "a query that it answers", shorten_line(str(refusal)))
     # A series has a name, tags that all its rows share, names of columns, and rows of values.
-    series = [part for result in results for part in result.get("series", ())]
-    if any(part.get("partial") for part in (*results, *series)):
+    all_series = [series for result in results for series in result.get("series", ())]
+    if any(part.get("partial") for part in (*results, *all_series)):
         raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
     rows = [
-        _join_tags(address, part.get("tags", {}), dict(zip(part["columns"], values, strict=True)))
-        for part in series
-        for values in part["values"]
+        _join_tags(address, series.get("tags", {}), dict(zip(series["columns"], values, strict=True)))
+        for series in all_series
+        for values in series["values"]
     ]
-    names = [name for part in series for name in (*part["columns"], *part.get("tags", {}))]
-    measurement = str(series[0].get("name", address.table)) if series else ""
-    return measurement, _make_columns(address, names, rows, read_time=lambda time: int(time), sorts=len(series) > 1)
+    names = [name for series in all_series for name in (*series["columns"], *series.get("tags", {}))]
+    measurement = str(all_series[0].get("name", address.table)) if all_series else ""
+    # Each series is in order of time by itself.
+    is_unsorted = len(all_series) > 1
+    return measurement, _make_columns(address, names, rows, read_time=lambda time: int(time), sorts=is_unsorted)
 
 
 def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
@@ -99,7 +101,7 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
             row.pop(name, None)
         if "_time" in row:
             row["time"] = row.pop("_time")
-        if "_field" not in row or "_value" not in row:  # pivoted, or fields of a query's own
+        if "_field" not in row or "_value" not in row:  # pivoted, or columns of a query's own: a row by itself
             joined[(number,)] = row
             continue
         name, value = str(row.pop("_field")), row.pop("_value")
@@ -130,7 +132,7 @@ def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
     A table has a line of types, one of names, its rows, and then an empty line.
     """
     types: list[str] = []
-    names: list[str] = []  # [] between two tables
+    names: list[str] = []  # of the columns of this table; [] until they come
     for cells in csv.reader(text.splitlines()):
         if not any(cells):
             names = []

@@ -59,16 +59,17 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
     too_long = next((name for name in columns if len(name.encode()) > LONGEST), None)
     if too_long is not None:
         raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(too_long))
-    # The parts of the statements: table, columns with their types, their names, cells column by column.
+    # The parts of the statements: the table, each column with its type, all their names.
     table = sql.Identifier(*address.written_table.split("."))
-    types = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
+    typed = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
     names = sql.SQL(", ").join(map(sql.Identifier, (PLANT, *columns)))
     cells = [_convert_cells(column) for column in columns.values()]
     times = _convert_cells(np.sort(columns[TIME]))
     try:
+        # One transaction: an error takes all of it back.
         with psycopg.connect(address.url) as connection:
             make = sql.SQL("CREATE TABLE IF NOT EXISTS {} (plant text NOT NULL, {})")
-            connection.execute(make.format(table, sql.SQL(", ").join(types)))
+            connection.execute(make.format(table, sql.SQL(", ").join(typed)))
             remove = sql.SQL("DELETE FROM {} WHERE plant = %s AND time BETWEEN %s AND %s").format(table)
             connection.execute(remove, (plant, times[0], times[-1]))
             with connection.cursor().copy(sql.SQL("COPY {} ({}) FROM STDIN").format(table, names)) as copy:

@@ -69,7 +69,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
         CutOffError: a packed file that is damaged or cut off, from there on.
     """
     try:
-        with path.open("rb") as file, _unpack(file) as unpacked:
+        with path.open("rb") as file, _open_unpacked(file) as unpacked:
             encoding = guess_encoding(unpacked.peek(len(WIDE[0])))
             errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
             with TextIOWrapper(unpacked, newline="", encoding=encoding, errors=errors) as text:
@@ -92,7 +92,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
         CutOffError: a packed file that is damaged or cut off, behind the lines before that.
     """
     total, rest, ended, damage = path.stat().st_size, b"", False, None
-    with path.open("rb") as file, _unpack(file) as unpacked:
+    with path.open("rb") as file, _open_unpacked(file) as unpacked:
         try:
             decode = _choose_decoder(unpacked)
         except DAMAGE as error:
@@ -122,7 +122,7 @@ def _read_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes
     return b"".join(parts), length < size, None
 
 
-def _unpack(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
+def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
     """Return the same file, or what is packed in it."""
     buffered = cast(BufferedReader, file)
     return gzip.GzipFile(fileobj=file) if buffered.peek(len(GZIP)).startswith(GZIP) else buffered
