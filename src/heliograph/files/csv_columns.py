@@ -43,7 +43,7 @@ def read_csv_blocks(
 
 def _read_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> Rows:
     """Return the rows of some lines: all at once where they are plain, else by their cells, which say what is wrong."""
-    # The names of the columns first.
+    # Line by line until the header, with the names of the columns, has come.
     rows, begin = list[CsvRow | InputError](), 0
     while begin < len(lines) and not text.header:
         end = lines.find(b"\n", begin) + 1 or len(lines)
@@ -115,7 +115,7 @@ class CsvColumnReader:
         for name, values in zip(header, numbers.T, strict=True):
             if self._only is not None and name not in self._only:
                 continue
-            if self._dated.get(name):
+            if self._dated.get(name):  # plain lines have no dates: its cells are empty here
                 columns[name] = np.full(len(values), "NaT", "datetime64[ns]")
                 continue
             columns[name] = values.copy()

@@ -293,11 +293,11 @@ def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: i
     """
     if not len(time):
         return 0
-    numbers = sequence[np.lexsort((sequence, time))]
-    steps = np.diff(numbers)
-    around = np.mod(steps, period) if period else steps
-    gaps = np.where(steps > 0, steps, np.where(around <= GAP, around, 1))
-    return int(np.sum(np.maximum(gaps - 1, 0)))
+    differences = np.diff(sequence[np.lexsort((sequence, time))])
+    # Those of a count that went through its largest number; 1, so that nothing is missing, after a restart.
+    around = np.mod(differences, period) if period else differences
+    advances = np.where(differences > 0, differences, np.where(around <= GAP, around, 1))
+    return int(np.sum(np.maximum(advances - 1, 0)))
 
 
 def number_equal_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:

@@ -131,7 +131,7 @@ class EventTable:
         values: Float[np.ndarray, "events size"],
         period: int,
     ) -> None:
-        """Append readings of a node as `add` does one after another; without a time (`NONE`) or a count (-1)."""
+        """Append readings of a node as `add` does one after another; `NONE` is no time, -1 no count."""
         columns = self._columns_of("")[node]
         time = np.where(time == NONE, arrival, time)
         for column, moments in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
@@ -262,14 +262,14 @@ class EventTable:
             ValueError: a step that is not positive.
         """
         results, second = {}, 1 if self.numbers else SECOND
-        for name, late in self.lateness().items():
+        for name, delays in self.lateness().items():
             size = self.step / SECOND if step is None and self.step is not None else step
             if size is None:
                 apart = np.diff(np.unique(self.columns[name].arrays()[0]))
                 counts_steps = self.numbers and self.steps
                 size = float(np.median(apart)) / second if len(apart) and not counts_steps else 1.0
-            if np.any(late > -size / 2):  # else nothing arrived at or after its step
-                results[name] = learn_delays(late, size)
+            if np.any(delays > -size / 2):  # else nothing arrived at or after its step
+                results[name] = learn_delays(delays, size)
         return results
 
     def judge(

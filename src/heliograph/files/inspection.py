@@ -128,7 +128,7 @@ class Topic:
         apart = np.diff(times) / SECOND
         span = float(apart.sum())
         rate = f"{len(apart) / span:.3g} Hz" if span > 0 else "-"
-        count = f"{max(len(times), self.messages)}"
+        count = f"{max(len(times), self.messages)}"  # some may have come at a time that is not known
         gap = f"{apart.max():.3g} s" if len(apart) else "-"
         quantiles = np.quantile(np.array(self.late), [0.5, 0.95, 1.0]) if self.late else []
         return [self.kind, count, rate, gap, " ".join(f"{value:.3g}" for value in quantiles) or "-"]
@@ -155,7 +155,7 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
         topics: by name, to which those of the bag are added.
         progress: called with the numbers of messages read and to be read.
     """
-    with open_bag(path) as (reader, cut):
+    with open_bag(path) as (reader, cut_off):
         # Types first, then each message's times, of which a header is read without decoding the rest.
         for connection in reader.connections:
             topics.setdefault(connection.topic, _describe_type(reader, connection.msgtype))
@@ -170,7 +170,7 @@ def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | Non
                     progress(done, total)
         except Exception as error:  # whatever damage makes a reader do
             return str(fail(f"{path}, after message {done}", "a bag without damage", error_text(error)))
-        return cut
+        return cut_off
 
 
 def _describe_type(reader: "AnyReader", kind: str) -> Topic:

@@ -79,7 +79,7 @@ class RecordingBlocks:
             raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
 
     def _yield_recordings(self, parts: Iterable[Rows]) -> Iterator[Recording]:
-        """Yield parts of a table as recordings, each behind the last row of the one before it."""
+        """Yield parts of a table as recordings, each of which goes on from the last row of the one before it."""
         order = BlockOrder(self._path, self._reader.network)
         for rows in parts:
             self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
@@ -92,11 +92,11 @@ class RecordingBlocks:
             self._reader.refused = []
             if not len(cells.numbers):
                 continue
-            before = order.last
+            last_before = order.last
             order.check_block(came, cells)
             with warnings.catch_warnings(record=True) as doubts:
                 warnings.simplefilter("always", UserWarning)
-                recording = self._reader.make_recording(cells, before)
+                recording = self._reader.make_recording(cells, last_before)
             self.doubts += [str(doubt.message) for doubt in doubts]
             yield recording
         order.check_left_out()

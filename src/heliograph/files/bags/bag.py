@@ -114,7 +114,9 @@ def _note_other_topics(path: Path, sources: Sources, counts: Counter[str], event
 
 @contextmanager
 def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
-    """Open a bag for reading; of an MCAP file that was cut off, what is whole, and a line that says so, else "".
+    """Open a bag and yield its reader, and a line that says where it was cut off, "" if it was not.
+
+    Of an MCAP file that was cut off the reader has what is whole.
 
     Raises:
         ValueError: no bag, or one that cannot be opened; one line that names it.
@@ -122,12 +124,12 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
     if not path.exists():
         raise fail(str(path), "a bag", "nothing of that name")
     with ExitStack() as stack:
-        readable, cut = path, ""
+        readable, cut_off = path, ""
         if path.suffix.lower() == ".mcap" and is_cut_off(path):
             readable, end = stack.enter_context(copy_whole_part(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
-            cut = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
-        yield stack.enter_context(_open_reader(path, readable)), cut
+            cut_off = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
+        yield stack.enter_context(_open_reader(path, readable)), cut_off
 
 
 @contextmanager
@@ -316,13 +318,14 @@ def measure_whole_records(path: Path) -> int:
     """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
     size, end = path.stat().st_size, len(MAGIC)
     # A record: a byte for its kind, eight for the length of its content, and this.
+    head = struct.Struct("<BQ")
     with path.open("rb") as file:
-        while end + 9 <= size:
+        while end + head.size <= size:
             file.seek(end)
-            kind, length = struct.unpack("<BQ", file.read(9))
-            if kind in (DATA_END, FOOTER) or end + 9 + length > size:
+            kind, length = head.unpack(file.read(head.size))
+            if kind in (DATA_END, FOOTER) or end + head.size + length > size:
                 break
-            end += 9 + length
+            end += head.size + length
     return end
 
 

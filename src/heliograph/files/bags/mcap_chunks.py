@@ -31,11 +31,12 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
     """
     from rosbags.rosbag2.storage_mcap import McapReader
 
-    # Anything but MCAP files with chunks is read by rosbags itself.
+    # Of one bag its MCAP file, or files. Anything without chunks, and with each message compressed by itself, is read
+    # by rosbags.
     bag: Any = getattr(reader.readers[0], "storage", None) if len(reader.readers) == 1 else None
     files = [bag] if isinstance(bag, McapReader) else getattr(bag, "storages", [])
-    indexed = files and all(isinstance(file, McapReader) and file.chunks for file in files)
-    if not indexed or bag.metadata.compression_mode == "message":
+    have_chunks = files and all(isinstance(file, McapReader) and file.chunks for file in files)
+    if not have_chunks or bag.metadata.compression_mode == "message":
         yield from (RawMessage(of, logged, bytes(data)) for of, logged, data in reader.messages(connections))
         return
     # One file after another, as a bag in parts was written.
@@ -59,9 +60,10 @@ def _merge_chunks(
     waiting: list[RawMessage] = []
     for chunk, next_start in zip(chunks, [*earliest[1:], None], strict=True):
         waiting = sorted([*waiting, *_read_chunk(storage, chunk, channels)], key=attrgetter("logged"))
-        end = len(waiting) if next_start is None else bisect_left(waiting, next_start, key=attrgetter("logged"))
-        yield from waiting[:end]
-        waiting = waiting[end:]
+        # Those before the earliest that a later chunk may hold.
+        ready = len(waiting) if next_start is None else bisect_left(waiting, next_start, key=attrgetter("logged"))
+        yield from waiting[:ready]
+        waiting = waiting[ready:]
 
 
 def _read_chunk(

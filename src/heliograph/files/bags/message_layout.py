@@ -144,7 +144,7 @@ class Decoder:
     """
 
     def __init__(self, reader: "AnyReader", sources: Sources):
-        self._definitions, self._sources, self._little = reader.typestore.fielddefs, sources, reader.is2
+        self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[Layout]](list)
 
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
@@ -156,15 +156,19 @@ class Decoder:
             readings = self._read_by_node(batch)
         except LayoutError:
             return False
-        for node, parts in readings.items():
-            rows = np.concatenate([block.rows for block in parts])
+        for node, blocks in readings.items():
+            # In the order in which the messages came.
+            rows = np.concatenate([block.rows for block in blocks])
             order = np.argsort(rows, kind="stable")
             logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
-            time, sequence, values = (
-                np.concatenate([getattr(block, name) for block in parts])[order]
-                for name in ("time", "sequence", "values")
+            table.add_many(
+                node,
+                arrival=logged,
+                time=np.concatenate([block.time for block in blocks])[order],
+                sequence=np.concatenate([block.sequence for block in blocks])[order],
+                values=np.concatenate([block.values for block in blocks])[order],
+                period=blocks[-1].period,
             )
-            table.add_many(node, logged, time, sequence, values, parts[-1].period)
         return True
 
     def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
@@ -173,12 +177,13 @@ class Decoder:
         Raises:
             LayoutError: messages that need a look at each.
         """
-        if not self._little:
+        if not self._is_ros2:  # bags of ROS 1 are encoded otherwise
             raise LayoutError
+        # By topic and size: the numbers of the messages.
         groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[Readings]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
-        if FEWEST * len(groups) > len(batch):
+        if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
             raise LayoutError
         for (topic, _), numbers in groups.items():
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
@@ -201,6 +206,7 @@ class Decoder:
         """
         known = self._layouts[connection.topic, table.shape[1]]
         left, index = np.arange(len(table)), 0
+        # One known layout after another; where none is left, a new one by the first message that has none.
         while len(left):
             if index == len(known):
                 paths = {path for source, *_ in self._sources.of(connection.topic) for path in _list_paths(source)}

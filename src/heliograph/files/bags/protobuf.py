@@ -87,7 +87,7 @@ class Schema:
 
     @staticmethod
     def of(data: bytes) -> "Schema":
-        """Read a FileDescriptorSet; raise ValueError at what is none."""
+        """Read a FileDescriptorSet, by the numbers of descriptor.proto; raise ValueError at what is none."""
         schema = Schema({}, {})
         for file in _select_fields(data, 1):
             syntax = _read_text_field(file, 12)
@@ -111,9 +111,9 @@ class Schema:
             # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
             fields[int(found[3])] = Field(
-                _decode_text(found[1]),
-                int(found[5]),
-                _decode_text(found.get(6, b"")).removeprefix("."),
+                name=_decode_text(found[1]),
+                kind=int(found[5]),
+                of=_decode_text(found.get(6, b"")).removeprefix("."),
                 repeated=found.get(4) == REPEATED,
                 implicit=implicit and not has_presence,
             )
@@ -186,7 +186,7 @@ def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)
-        number, wire = key >> 3, key & 7
+        number, wire = key >> 3, key & 7  # the wire type is the last three bits
         value: Wire
         if wire == VARINT:
             value, at = _read_varint(data, at)

@@ -24,10 +24,11 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
     """Return the estimates of a recording as columns, with what was predicted of each row where it is given."""
     columns = [(TIME, record.time)]
     # Node and filter are part of a name where there are several of them.
-    several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
+    has_several_nodes = len(record.estimates) > 1
+    has_several_filters = any(len(filters) > 1 for filters in record.estimates.values())
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
-            prefix = "".join(f"{label}." for label, used in zip((node, name), several, strict=True) if used)
+            prefix = (f"{node}." if has_several_nodes else "") + (f"{name}." if has_several_filters else "")
             columns += [(prefix + key, values) for key, values in _make_columns(record.states, record.units, estimate)]
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in smoothed:  # which may cover the last rows alone

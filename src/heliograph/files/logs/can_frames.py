@@ -220,7 +220,7 @@ def _open_frames(path: Path, stack: ExitStack) -> _OpenedFrames:
 
         blf = BLFReader(path)
         stack.callback(blf.stop)
-        return _OpenedFrames(blf, blf.start_timestamp, 0.0)
+        return _OpenedFrames(blf, begin=blf.start_timestamp, shift=0.0)
     if kind == ".asc":
         return _open_asc(path, stack)
     import asammdf
@@ -228,7 +228,7 @@ def _open_frames(path: Path, stack: ExitStack) -> _OpenedFrames:
 
     with asammdf.MDF(path) as file:
         begin = file.start_time.timestamp()
-    return _OpenedFrames(stack.enter_context(MF4Reader(path)), begin, 0.0)
+    return _OpenedFrames(stack.enter_context(MF4Reader(path)), begin=begin, shift=0.0)
 
 
 def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
@@ -249,7 +249,7 @@ def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
         expected = "times from the log's begin ('timestamps absolute' in its header)"
         raise fail(str(path), expected, "times from each event to the next")
     begin = datetime.fromtimestamp(header.start_time).replace(tzinfo=UTC).timestamp() if header.start_time else 0.0
-    return _OpenedFrames(stack.enter_context(ASCReader(path)), 0.0, begin)
+    return _OpenedFrames(stack.enter_context(ASCReader(path)), begin=0.0, shift=begin)
 
 
 def _join_names(names: list[str]) -> str:

@@ -73,8 +73,8 @@ def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iter
     # By series the names of its signals, and their values.
     fields = [list(each.values) for each in series.values()]
     columns = [[values.tolist() for values in each.values.values()] for each in series.values()]
-    for number, k in enumerate(np.argsort(times, kind="stable").tolist(), 1):
-        i, row = series_numbers[k], rows[k]
-        moment = round(begin + float(times[k]), DIGITS)
-        content = {name: column[row] for name, column in zip(fields[i], columns[i], strict=True)}
-        yield FileMessage(f"{path}, message {number}", names[i], {STAMP: moment, **content}, moment)
+    for number, index in enumerate(np.argsort(times, kind="stable").tolist(), 1):
+        of, row = series_numbers[index], rows[index]
+        moment = round(begin + float(times[index]), DIGITS)
+        content = {name: column[row] for name, column in zip(fields[of], columns[of], strict=True)}
+        yield FileMessage(f"{path}, message {number}", names[of], {STAMP: moment, **content}, moment)

@@ -21,6 +21,7 @@ from heliograph.numerics.times.dates import looks_like_date, parse_moment
 from heliograph.simulation.network import Network
 
 EXACT = 2**53  # up to here doubles hold every whole number
+MOST_REASONS = 3  # that are kept of messages that could not be read
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES, PLANT = "node", "sequence", "time", "arrival", "values", "plant"
 NOTHING = np.zeros(0)
 OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
@@ -79,7 +80,7 @@ class OwnMessages:
                 self.broken = str(error)
                 return
             self.refused += 1
-            self.reasons += [str(error)] if len(self.reasons) < 3 else []
+            self.reasons += [str(error)] if len(self.reasons) < MOST_REASONS else []
 
     def events(self) -> EventTable:
         """Return the events that were read, with notes on their times and on what was refused.

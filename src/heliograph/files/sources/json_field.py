@@ -336,24 +336,25 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
 
     `where`: as `json_field` takes it: one condition, or several in a list, or None.
     """
-    several = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
-    available = tuple(single for single in several if isinstance(single, Available))
+    conditions = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
+    available = tuple(condition for condition in conditions if isinstance(condition, Available))
     pairs = list[tuple[str, object]]()
-    for single in several:
-        if isinstance(single, Available):
+    for condition in conditions:
+        if isinstance(condition, Available):
             continue
-        if not isinstance(single, Mapping) or not all(isinstance(path, str) for path in single):
+        if not isinstance(condition, Mapping) or not all(isinstance(path, str) for path in condition):
             raise fail("json_field, where", "a dictionary of paths with their values, or Available", show_value(where))
-        pairs += single.items()
-    plain, values = (str, int, float, bool, type(None)), dict[str, Container[object]]()
+        pairs += condition.items()
+    allowed_by_path = dict[str, Container[object]]()
     for path, value in pairs:
-        if path in values:
+        if path in allowed_by_path:
             raise fail("json_field, where", "each path once", show_value(path))
-        allowed = (value,) if isinstance(value, plain) else value
+        # A single value, a text too, is the only one that is allowed.
+        allowed = (value,) if isinstance(value, str | int | float | bool | None) else value
         if not isinstance(allowed, Container):
             raise fail(f"json_field, where, {path!r}", "a value, or a list, set or range of them", show_value(allowed))
-        values[path] = allowed
-    return values, available
+        allowed_by_path[path] = allowed
+    return allowed_by_path, available
 
 
 def _read_valid(valid: object) -> Allowed:

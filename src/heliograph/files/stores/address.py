@@ -82,7 +82,7 @@ def parse_store(url: str) -> StoreAddress:
     location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
     try:
         parts = urlsplit(location)
-        host, _ = parts.hostname, parts.port  # the port is only checked
+        host, _ = parts.hostname, parts.port  # `port` is read because it raises at one that is no number
     except ValueError:
         raise fail("store", SHAPE, "an address that cannot be read") from None
     database = unquote(parts.path).strip("/")
@@ -96,7 +96,7 @@ def parse_store(url: str) -> StoreAddress:
         raise fail(store, ASKED, "both, or one without a value")
     if not is_influx and language not in ("", "query"):
         raise fail(store, "query=SELECT..., as InfluxDB alone has others", language)
-    # The server's own options stay in the URL.
+    # PostgreSQL gets its own options in the URL; those of InfluxDB have been read.
     kept = [option for option in parts.query.split("&") if not is_influx and not option.startswith("table=")]
     return StoreAddress(
         kind=parts.scheme,
