@@ -148,7 +148,7 @@ def filter_in_blocks(
 
     blocks = RecordingBlocks(path, network, options.strict, options.ignore_unknown, block, progress)
     written, doubts = WrittenRows(), BlockLines()
-    record = None  # of the block before, from whose end the filters go on
+    record: Record | None = None  # of the block before, from whose end the filters go on
     try:
         with open_table(out) as append:
             for recording in blocks:

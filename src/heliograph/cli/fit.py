@@ -148,8 +148,8 @@ def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losse
 def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str, Fates]":
     """Return which messages of each node arrived, of all that were due, by node or "node.component".
 
-    Left out are nodes of which nobody knows when a message is due: where rows are messages of any node, those without a
-    rate of their own.
+    Nodes are left out of which nobody knows when a message is due. Those are nodes without a rate of their own, where
+    each row is a message of one node.
     """
     from heliograph.learning.losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.arrivals import list_arrivals

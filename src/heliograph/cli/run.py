@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.filtered_blocks import WrittenRows, run_in_blocks
+from heliograph.cli.filtered_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
 from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
 from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
@@ -80,7 +80,7 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        said_of_blocks = None  # lines on a long table, which is filtered in blocks; None where all is read as a whole
+        said_of_blocks: SaidOfBlocks | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
         measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)

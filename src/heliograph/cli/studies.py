@@ -170,7 +170,7 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
     # Options of the command, checked as numbers.
     for name, value in options.items():
         if value is not None:
-            values[name] = OptionValue(value)
+            values[name] = OptionValue(value)  # marked as an option's, for errors
             if name == "seed":
                 check_seed("--seed", value)
             elif name == "runs":

@@ -97,8 +97,8 @@ class Topic:
         if not self.dates:
             self._choose_clock()
             return
-        vary = (path for path, (moments, _) in self.dates.items() if len(set(moments)) > 1)
-        self.time = next(vary, next(iter(self.dates)))
+        varying = (path for path, (moments, _) in self.dates.items() if len(set(moments)) > 1)
+        self.time = next(varying, next(iter(self.dates)))
         moments, self.late = self.dates[self.time]
         self.logged = self.logged or moments
 

@@ -202,6 +202,7 @@ class RowReader:
         Raises:
             ValueError: times that go backwards, a time step that is none.
         """
+        # The row before goes in first, and its own row is left out at the end.
         begin = 0 if before is None else 1
         cells = cells if before is None else join_cells([before, cells])
         kept = keep_rows(cells.numbers, self.network, 1 if before is None else int(before.numbers[0]))
@@ -209,7 +210,7 @@ class RowReader:
         u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
         measurements = {node: kept.fill(values)[begin:] for node, values in cells.measurements.items()}
         truth = None
-        if cells.truth:
+        if cells.truth:  # of some states, or of all; of others it is unknown
             unknown = np.full(len(cells.time), np.nan)
             states = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
             truth = np.stack(states, axis=1)[begin:]

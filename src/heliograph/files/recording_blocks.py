@@ -51,7 +51,8 @@ class RecordingBlocks:
     ):
         self._path, self._strict, self._block, self._progress = path, strict, block, progress
         self._reader = RowReader(network, str(path), strict, ignore_unknown)
-        self._last_number, self._done, self._total = 0, 0, 0
+        self._last_number = 0  # of the rows read so far, refused ones included
+        self._done, self._total = 0, 0  # how much of the file is read, and of how much, as progress has it
         self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
 
     @property
@@ -115,7 +116,7 @@ class RecordingBlocks:
 
 def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]:
     """Yield a recording that comes in parts in blocks of so many rows, of which the last may have fewer."""
-    held, count = list[Recording](), 0
+    held, count = list[Recording](), 0  # what was not yielded yet, and its rows
     for part in parts:
         held.append(part)
         count += len(part.time)
@@ -124,7 +125,8 @@ def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]
         joined = _join_recordings(held)
         for begin in range(0, count - rows + 1, rows):
             yield _select_rows(joined, slice(begin, begin + rows))
-        held, count = [_select_rows(joined, slice(count - count % rows, None))], count % rows
+        left = count % rows
+        held, count = [_select_rows(joined, slice(count - left, None))], left
     if count:
         yield _join_recordings(held)
 

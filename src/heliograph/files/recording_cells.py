@@ -93,17 +93,18 @@ def list_truth_columns(network: Network) -> dict[str, str]:
 def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     """Return the allowed column names of each node's components, the preferred one first."""
     names = {node: receiver.received_names for node, receiver in network.nodes.items()}
+    # How many things each name may be meant for: one alone may be called by it without its node.
     uses = Counter([TIME, *network.inputs])
     for node, components in names.items():
         uses.update([*components, *(f"{node}.{name}" for name in components)])
 
-    def allowed(node: str, name: str) -> tuple[str, ...]:
+    def list_allowed(node: str, name: str) -> tuple[str, ...]:
         full = f"{node}.{name}"
         if uses[name] > 1:
             return (full,)
         return (name, full) if len(names) == 1 else (full, name)
 
-    return {node: [allowed(node, name) for name in components] for node, components in names.items()}
+    return {node: [list_allowed(node, name) for name in components] for node, components in names.items()}
 
 
 def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:

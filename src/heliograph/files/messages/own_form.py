@@ -186,16 +186,17 @@ class OwnReader:
         """
         if row.keys() == self._columns:
             return
+        # The columns of a table are those of its header: an error of all of it.
         place = f"{self.source}, header" if self._table else where
-        make = HeaderError if self._table else InputError
+        error_type = HeaderError if self._table else InputError
         known = [*OWN, *(name for names in self.components.values() for name in names)]
         for name in () if self._ignore else row:
             if name not in known:
                 listed = ", ".join(dict.fromkeys(known))
-                raise make(str(fail(place, f"only the columns {listed}", repr(name))))
+                raise error_type(str(fail(place, f"only the columns {listed}", repr(name))))
         for name in (NODE, SEQUENCE, TIME):
             if name not in row:
-                raise make(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
+                raise error_type(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
     def _read_moment(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
@@ -225,7 +226,7 @@ class OwnReader:
             if self.zero is None:
                 self.zero = cell if abs(cell) >= EXACT else 0
             number = float(cell - self.zero)
-            if self.rounded is None and int(number) != cell - self.zero:
+            if self.rounded is None and int(number) != cell - self.zero:  # the first that a double does not hold
                 self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
