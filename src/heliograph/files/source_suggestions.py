@@ -19,6 +19,7 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
     lines.append("sources = {")
     for topic in topics.values():
         topic.choose_time()
+    # Whether any topic has dates: then a clock that counts from its own start needs the date of that.
     dated = any(topic.dates or (topic.logged and not topic.own_clock) for topic in topics.values())
     for name, topic in sorted(topics.items()):
         fields = topic.list_measured()

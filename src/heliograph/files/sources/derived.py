@@ -71,10 +71,13 @@ class Covariance:
         """Return the entry, of numbers or of arrays; NaN where it is unknown."""
         # In the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
         diagonal, (entry, mirror, row_variance, column_variance) = numbers[: self.size], numbers[self.size :][:4]
+        # As messages of ROS say it, nothing is known where the first entry is -1, or where all variances are 0.
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
+        # Entries ij and ji that differ are no covariance.
         deviations = np.sqrt(np.abs(np.asarray(row_variance) * column_variance))
         known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * deviations
+        # The kind of the covariance, where the message has one: 0 is unknown.
         for kind in numbers[self.size + 4 :]:
             known &= np.asarray(kind) != 0
         return np.where(known, entry, np.nan)
@@ -233,6 +236,7 @@ class PlaneCovariance:
 
     def of(self, *numbers: Any) -> Any:
         """Return the entry, of numbers or of arrays; NaN where the covariance or the position is unknown."""
+        # The numbers of the position, then those of each entry of the covariance, row by row.
         begin = len(self.position.parts)
         latitude, longitude, _ = self.position.coordinates(*numbers[:begin])
         entries = []

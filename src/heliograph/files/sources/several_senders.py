@@ -38,7 +38,10 @@ class SenderCounter:
         return self.describe_several_senders() if self._noted & (self._noted - 1) == 0 else []
 
     def describe_several_senders(self) -> list[str]:
-        """Return a line for each field of a topic that has several values which come again; each is returned once."""
+        """Return a line for each field of a topic that has several values which come again; each is returned once.
+
+        That the values of a field come again, twice on average, is how names of several senders look.
+        """
         found: dict[tuple[str, str], list[object]] = {}
         for (topic, _, _, name), counts in self._counts.items():
             if (topic, name) not in self._said and 2 <= len(counts) <= MANY and counts.total() >= 2 * len(counts):

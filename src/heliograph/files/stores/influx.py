@@ -88,7 +88,7 @@ def _batch_lines(
     for time, *cells in zip(moments.astype(np.int64).tolist(), *(c.tolist() for c in columns.values()), strict=True):
         fields = ",".join(f"{n}={_print_value(v)}" for n, v in zip(names, cells, strict=True) if isfinite(v))
         rows += 1
-        if fields:
+        if fields:  # a point without fields is none
             lines.append(f"{key} {fields} {time}\n")
             size += len(lines[-1])
         if size > BATCH:
