@@ -79,7 +79,7 @@ def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
         return parse_dates(column, name)
     texts = [x for x in column if isinstance(x, str | bytes)]
     try:
-        if texts:
+        if texts:  # `float` would read some
             raise TypeError
         return np.array([np.nan if value is None else float(value) for value in column])
     except (TypeError, ValueError, OverflowError):

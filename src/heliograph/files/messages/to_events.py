@@ -308,5 +308,5 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     events.notes += [f"{path}: {note}" for note in (*sources.notes, *sources.senders.describe_several_senders())]
     if sources.stored:
         events.notes.append(f"{path}: {sources.stored} stored messages were left out: without time= they have no date")
-    if sources.time_counts_steps is False and not len(events) and not events.reasons and not events.broken:
+    if not sources.time_counts_steps and not len(events) and not events.reasons and not events.broken:
         raise fail(str(path), f"a message of the sources, {', '.join(sources.topics[:8])}", "none")
