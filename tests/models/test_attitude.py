@@ -50,3 +50,13 @@ def test_derivatives_exist_where_nothing_turns():
 def test_other_shapes_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+@pytest.mark.parametrize("length", [1e-320, 1e-170, 1.0, 1e170])
+def test_a_quaternion_may_have_any_length(length):
+    """Its square is 0 or infinite for three of these; XLA may take what is below 1e-300 for 0."""
+    quaternion = length * np.array([1.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(models.from_quaternion(quaternion), [np.pi / 2, 0, 0], rtol=1e-15)
+    with jax.enable_x64(True):
+        traced = jax.jit(models.from_quaternion)(jnp.asarray(max(quaternion[0], 1e-300) * np.sign(quaternion)))
+    np.testing.assert_allclose(traced, [np.pi / 2, 0, 0], rtol=1e-15)

@@ -15,7 +15,9 @@ from heliograph.numerics.traced import is_traced
 from heliograph.random_affine.noise import Vector
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
-SOME_TURN = (0.3, -0.2, 0.5)  # radians about the three axes: no attitude is at rest there
+SOME_TURN = (0.3, -0.2, 0.5)  # radians, about the three axes or of any states: no attitude is at rest there
+
+Turned = tuple[np.ndarray, Sequence[np.ndarray] | np.ndarray, tuple[np.ndarray, ...]]  # a state, its forms, the rest
 
 
 def check_turns(
@@ -28,7 +30,8 @@ def check_turns(
 ) -> None:
     """Raise ValueError where a full turn of an angle or an attitude changes f(center), but for full turns of results.
 
-    What depends on a traced number has no value to judge: it was judged where its numbers were known.
+    Tried at the center and at one state that is no special case: what differs elsewhere alone is not found. What
+    depends on a traced number has no value to judge: it was judged where its numbers were known.
 
     Args:
         name: of what has the function, for the error.
@@ -40,54 +43,49 @@ def check_turns(
     """
     if not (given.angles or given.rotations) or is_traced(center):
         return
-    # Angles: the center with a full turn more in each of them.
+    # A state that is no special case, with rates that are not 0: at 0 sin(angle / 2) and angle * rate hide.
     center = np.asarray(center)
-    turned = center + TURN * np.eye(len(center))[list(given.angles)]
-    _compare_turned(f"{name} with circular states", function, center, turned, results, rest)
-    # Attitudes: f is asked at a general state, since the center's attitude may be a special case, such as no turn at
-    # all. Every attitude there has a second rotation vector, a full turn longer, at which f has to be the same.
-    change = np.zeros(len(center))
-    change[list(given.rotations)] = np.resize(SOME_TURN, len(given.rotations))
-    general_state = given.plus(center, change)
+    general_state = given.plus(center, np.resize(SOME_TURN, len(center)))
+    ones = tuple(np.ones_like(values) for values in rest)
+    # Angles: a full turn more in each of them, at the center too.
+    turns = TURN * np.eye(len(center))[list(given.angles)]
+    if len(turns):
+        at_both = [(center, center + turns, rest), (general_state, general_state + turns, ones)]
+        _compare_turned(f"{name} with circular states", function, at_both, results)
+    # Attitudes: by the other rotation vector of each.
     others = [_turn_fully(general_state, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
-    ones = tuple(np.ones_like(values) for values in rest)  # inputs of 0, such as turn rates, could hide a change
-    kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
-    _compare_turned(kind, function, general_state, others, results, ones)
+    if others:
+        kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
+        _compare_turned(kind, function, [(general_state, others, ones)], results)
 
 
-def _compare_turned(
-    name: str,
-    function: Callable[..., jax.Array],
-    center: np.ndarray,
-    turned: Sequence[np.ndarray] | np.ndarray,
-    results: Manifold,
-    rest: tuple[np.ndarray, ...],
-) -> None:
+def _compare_turned(name: str, function: Callable[..., jax.Array], places: Sequence[Turned], results: Manifold) -> None:
     """Raise ValueError where f differs, by more than full turns of its results, at states that are one and the same.
 
     Args:
         name: of what has the function, for the error.
         function: f.
-        center: a state (n,).
-        turned: the same state with full turns in some components, each (n,).
+        places: states, other forms of each, and what else f takes there.
         results: which components of f(x) are angles and attitudes.
-        rest: further arguments of f.
     """
-    if not len(turned):
-        return
-    # f at the state and at each of its other forms, by one compiled program.
+    # f at every state and at each of its other forms, by one compiled program.
+    points = np.concatenate([np.stack([state, *turned]) for state, turned, _ in places])
+    counts = [1 + len(turned) for _, turned, _ in places]
+    by_point = [rest for (*_, rest), count in zip(places, counts, strict=True) for _ in range(count)]
+    rests = tuple(np.stack(values) for values in zip(*by_point, strict=True))
     try:
-        at_center, *values = compute_once(_values_at, _values_by_xla, (function, np.stack([center, *turned]), rest))
+        found = np.asarray(compute_once(_values_at, _values_by_xla, (function, points, rests)))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
-    # What is more than full turns of the results, and more than the rounding of 2 pi in a steep function.
-    for value, other in zip(values, turned, strict=True):
-        change = np.abs(results.difference(np.asarray(value), np.asarray(at_center)))
-        if np.any(change > SAME * (1 + np.abs(at_center))):
-            turned_states = np.flatnonzero(other != center).tolist()
-            named = f"state {turned_states[0]}" if len(turned_states) == 1 else f"states {turned_states}"
-            got = f"a change of {change.max():.3g} by a turn of {named}"
-            raise fail(name, "one that a full turn does not change", got)
+    # Differences but for full turns, beyond the rounding of 2 pi in a steep function.
+    for (state, turned, _), values in zip(places, np.split(found, np.cumsum(counts)[:-1]), strict=True):
+        for value, other in zip(values[1:], turned, strict=True):
+            change = np.abs(results.difference(value, values[0]))
+            if np.any(change > SAME * (1 + np.abs(values[0]))):
+                numbers = np.flatnonzero(other != state).tolist()
+                words = f"state {numbers[0]}" if len(numbers) == 1 else f"states {numbers}"
+                got = f"a change of {change.max():.3g} by a turn of {words}"
+                raise fail(name, "one that a full turn does not change", got)
 
 
 def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
@@ -103,9 +101,9 @@ def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
     return other
 
 
-def _values_at(function: Callable[..., jax.Array], points: jax.Array, rest: tuple[jax.Array, ...]) -> jax.Array:
-    """Return f(x) at each of some points x."""
-    return jnp.stack([jnp.asarray(function(point, *rest)) for point in points])
+def _values_at(function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]) -> jax.Array:
+    """Return f(x) at each of some points x, with further arguments (points, ...)."""
+    return jnp.stack([jnp.asarray(function(x, *(values[i] for values in rests))) for i, x in enumerate(points)])
 
 
 _values_by_xla = quickly_compiled(_values_at)

@@ -65,9 +65,10 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
         ValueError: an array of another shape, a quaternion of length 0.
     """
     values = _read_array("quaternion", quaternion, 4)
-    if not is_traced(values) and not (values**2).sum(axis=-1).all():
+    largest = abs(values).max(axis=-1, keepdims=True)
+    if not is_traced(values) and not largest.all():
         raise fail("quaternion", "four numbers of which one is not 0", "all of them 0")
-    attitude: Array = rotation_vector_of(values)
+    attitude: Array = rotation_vector_of(values / largest)  # so that no square overflows, or is 0
     return attitude
 
 
