@@ -63,6 +63,20 @@ def test_horizons_are_rows(call, capsys):
     assert "--horizons: expected numbers of rows" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--horizons", "0,5"], "--horizons: expected"),
+        (["--skip", "-1"], "--skip: expected"),
+        (["--skip", "0", "--refit", "20"], "--skip: expected"),
+    ],
+)
+def test_counts_are_checked_before_anything_is_read(call, tmp_path, options, said, capsys):
+    (tmp_path / "data.csv").unlink()
+    assert cli.main([*call, *options]) == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_refits_are_those_of_the_library(call, tmp_path, capsys):
     """`--refit 20`: scores as of `hg.backtest` with fits to the rows before; without free numbers a line."""

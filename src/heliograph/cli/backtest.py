@@ -56,6 +56,7 @@ def backtest(
     target = choose_results_folder("backtest", out, NAME) / NAME
     rows_ahead = _parse_rows_ahead(horizons)
     check_count("--refit", refit, 0)
+    check_count("--skip", skip, 1 if refit else 0)
 
     def compute(advance: "Advance") -> "heliograph.forecasting.Backtest":
         """Read the data of one plant, and forecast from its rows."""

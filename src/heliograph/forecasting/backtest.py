@@ -167,10 +167,10 @@ def backtest(
 
     Source: rolling-origin evaluation, Tashman, Out-of-sample tests of forecasting accuracy (2000).
     """
-    record = run(network, measurements, inputs, time, truth)
-    rows = len(record.time)
     ahead = sorted({check_count("horizon", h) for h in items("horizons", horizons, "numbers of rows")})
     first = check_count("skip", skip, 0 if refit is None else 1)
+    record = run(network, measurements, inputs, time, truth)
+    rows = len(record.time)
     if not ahead or ahead[-1] + first >= rows:
         raise fail("backtest", f"horizons that, behind {first} skipped rows, end within the {rows} rows of data", ahead)
     u = read_plant_inputs(network, inputs, rows)
