@@ -142,3 +142,22 @@ def test_a_mixture_of_a_noise_and_a_hop_has_one_transmitter():
     mixture = atoms.Mixture([jamming, hg.hop(1.0, 0.2)], [0.3, 0.7])
     sent = hg.power(network(hg.amplify_and_forward([mixture, hg.hop(1.0, 0.1)]))).mean
     assert sent == pytest.approx({"node.hop1": 1.5, "node.hop2": 0.3 * 0.5 + 0.7 * 1.7}, rel=1e-12)
+
+
+def test_a_steady_power_with_inputs_needs_a_horizon():
+    """Inputs of 3 were ignored: the steady state is that of inputs of 0."""
+    driven = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0, [[1.0]])
+    assert hg.power(network(hg.hop(1.0, 0.3), driven)).total == pytest.approx(1 / 0.19 + 0.5, rel=1e-12)
+    with pytest.raises(ValueError, match="inputs: expected a horizon"):
+        hg.power(network(hg.hop(1.0, 0.3), driven), inputs=[[3.0]])
+
+
+def test_one_sensor_with_feedback_does_not_hide_that_another_grows():
+    """Feedback keeps what one node sends bounded; the other sends an unstable state."""
+    plant, link = hg.LinearPlant([[1.2]], 1.0, [0.0], 1.0), hg.hop(1.0, 0.3)
+    fed = hg.Node(SENSOR, link, {"fed": hg.filters.fed_back_filter(plant, SENSOR, link)})
+    alone = hg.power(hg.Network(plant, {"fed": fed}), horizon=50)
+    assert np.isnan(alone.growth) and alone.peak["fed.hop1"] < 3
+    both = hg.power(hg.Network(plant, {"fed": fed, "plain": hg.Node(SENSOR, link, {})}), horizon=50)
+    assert both.growth == pytest.approx(1.44, rel=1e-12) and "unstable" in both.words
+    np.testing.assert_array_equal(both.over_time["fed.hop1"], alone.over_time["fed.hop1"])

@@ -89,7 +89,7 @@ def backtest(
 
 def _parse_rows_ahead(horizons: str) -> list[int]:
     """Return the horizons of the option, which have to be numbers of rows; raise ValueError at a span or a date."""
-    from heliograph.numerics.check import fail
+    from heliograph.numerics.check import check_count, fail
     from heliograph.numerics.times.dates import horizons_in
 
     asked = horizons_in(horizons)  # one number, or a list
@@ -97,6 +97,8 @@ def _parse_rows_ahead(horizons: str) -> list[int]:
     rows_ahead = [horizon for horizon in listed if isinstance(horizon, int)]
     if len(rows_ahead) < len(listed):
         raise fail("--horizons", "numbers of rows, as 1,3,12", horizons)
+    for horizon in rows_ahead:
+        check_count("--horizons", horizon)
     return rows_ahead
 
 

@@ -37,7 +37,7 @@ class SentPower(Module):
 
     over_time: mean square at each step by name, (steps,), one step if steady; standard_error of it, zero where it is
     exact. growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each
-    step where it is above 1; NaN where the plant is not linear.
+    step where it is above 1; NaN where the plant is not linear, or every sensor sends its innovation.
     """
 
     over_time: dict[str, Float[np.ndarray, "steps"]]
@@ -82,7 +82,7 @@ def power(
     Args:
         network: the network.
         horizon: number of steps from the plant's initial law on; the steady state of a linear plant unless given.
-        inputs: inputs of the plant, (horizon, inputs); zero unless given.
+        inputs: inputs of the plant, (horizon, inputs); zero unless given, as in the steady state.
         runs: number of drawn trajectories, where plant or sensors are not linear (default 1000).
         seed: of the draws (default 0).
 
@@ -92,9 +92,11 @@ def power(
 
     Raises:
         ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; inputs of
-            another shape.
+            another shape, or without a horizon.
     """
     instance("network", network, Network, "a Network")
+    if horizon is None and inputs is not None:
+        raise fail("inputs", "a horizon beside them, as the steady power is that of inputs of 0", "none")
     plant = first(network.plant)
     growth = spectral_radius(np.asarray(plant.matrix)) ** 2 if isinstance(plant, LinearPlant) else float("nan")
     if network.relays is not None:
@@ -116,8 +118,11 @@ def power(
         runs, seed = check_count("runs", runs, BATCHES), check_seed("seed", seed)
         moments = _draw_moments(network.plant, sources, u, runs, seed)
     # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
-    for name, informing in _find_feedback_filters(network).items():
-        moments[name], growth = _compute_innovation_moments(informing, u, horizon), float("nan")
+    informed = _find_feedback_filters(network)
+    for name, informing in informed.items():
+        moments[name] = _compute_innovation_moments(informing, u, horizon)
+    if informed.keys() == sources.keys():
+        growth = float("nan")
     # What each hop of the channels sends, (batches, steps): of drawn trajectories in batches whose spread gives the
     # standard error, of exact moments in one batch, without error.
     over_time, standard_error = {}, {}
