@@ -130,3 +130,20 @@ def test_other_encodings_are_refused(folder, capsys):
     expected = "messages of ROS, in JSON, or in Protobuf with its schema"
     assert err == f"heliograph: log.mcap: expected {expected}, got protobuf without its schema\n"
     assert cli.main(["inspect", "log.mcap"]) == 2 and "got protobuf" in capsys.readouterr().err
+
+
+def test_a_part_of_a_type_that_is_not_described_is_one_line(tmp_path):
+    """`wstring` of ROS 2, which nobody decodes here: it was a KeyError with a traceback."""
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("tank/msg/Named", "ros2msg", b"float64 level\nwstring name\n")
+        tank = writer.register_channel("/tank", "cdr", schema)
+        for k in range(20):  # many, so that they are decoded together
+            moment = START + k * 10**8
+            writer.add_message(tank, moment, bytes([0, 1, 0, 0]) + bytes(8) + bytes([1, 0, 0, 0, 97, 0]), moment)
+        writer.finish()
+    plant, sensor = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0, [[0.0]], inputs=["dt"]), hg.LinearSensor([[1.0]], 1.0)
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {})})
+    with pytest.raises(ValueError, match=r"/tank, logged at .*: expected a message of tank/msg/Named"):
+        hg.files.read_messages(tmp_path / "log.mcap", network, {"/tank": hg.files.json_field("level", node="a")})

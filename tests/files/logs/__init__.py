@@ -69,13 +69,13 @@ def find_begin(path):
         return file.start_time.timestamp()
 
 
-def write_mdf(path, invalid=(), rows=slice(None)):
+def write_mdf(path, invalid=(), rows=slice(None), unit="km/h"):
     asammdf = pytest.importorskip("asammdf", reason="the extra `mdf`")
     bits = np.isin(np.arange(COUNT), invalid)
     file = asammdf.MDF(version="4.10")
     file.start_time = datetime.datetime.fromtimestamp(START, datetime.UTC)
     marks = bits[rows] if len(invalid) else None
-    speed = asammdf.Signal(SPEED[rows], TIME[rows], name="FrontLeft", unit="km/h", invalidation_bits=marks)
+    speed = asammdf.Signal(SPEED[rows], TIME[rows], name="FrontLeft", unit=unit, invalidation_bits=marks)
     file.append([speed], acq_name="WheelSpeeds")
     file.append([asammdf.Signal(np.arange(5.0), np.arange(5) / 2, name="YawRate", unit="deg/s")])
     file.save(path, overwrite=True)

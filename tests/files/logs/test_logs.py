@@ -253,3 +253,17 @@ def test_several_logs_in_a_folder_are_one_recording(tmp_path, kind, capsys):
     assert "WheelSpeeds" in capsys.readouterr().out
     with pytest.raises(ValueError, match="expected a message 'Yaw' of the sources"):
         hg.files.read_messages(folder, logs.car(), hg.files.LogSources({"Yaw": logs.wheel()}, dbc=sources.dbc))
+
+
+@pytest.mark.parametrize(("units", "refused"), [(("km/h", "m/s"), True), (("km/h", ""), False)])
+def test_a_unit_that_changes_from_log_to_log_is_refused(tmp_path, units, refused):
+    """One scale for both would make one of them wrong by 3.6; a log that names no unit contradicts none."""
+    for name, rows, unit in (("1", slice(0, 15), units[0]), ("2", slice(15, None), units[1])):
+        logs.write_mdf(tmp_path / f"{name}.mf4", rows=rows, unit=unit)
+    sources = hg.files.LogSources({"WheelSpeeds": logs.wheel()})
+    if refused:
+        with pytest.raises(ValueError, match="expected one unit of 'FrontLeft' in all logs, got km/h or m/s"):
+            hg.files.read_messages(tmp_path, logs.car(), sources)
+    else:
+        notes = hg.files.read_messages(tmp_path, logs.car(), sources).notes
+        assert any("WheelSpeeds.FrontLeft in km/h" in note for note in notes)

@@ -79,6 +79,8 @@ class Layout:
 
         `prefix`: path of the message in the whole one, with a dot; "" for that itself.
         """
+        if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
+            raise LayoutError
         for name, (node, of) in self._definitions[kind][1]:
             begin = self._place_field(begin, str(node.name), of, prefix + name)
         return begin

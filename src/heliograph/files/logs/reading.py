@@ -14,6 +14,7 @@ from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, fail
 
 LISTED = 8  # names in one line
+OR = " or "  # between units of a signal that differ from log to log
 
 
 def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
@@ -40,11 +41,14 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
             yield from log.messages
             notes.extend(log.notes)
 
-    # By topic the units and bits of the signals that any of the logs has.
+    # By topic the units and bits of the signals that any of the logs has; units that differ stand side by side.
     units, bits = dict[str, dict[str, str]](), dict[str, dict[str, int]]()
     for log in logs:
         for topic, signals in log.units.items():
-            units[topic] = {**units.get(topic, {}), **signals}
+            known = units.setdefault(topic, {})
+            for name, unit in signals.items():
+                several = dict.fromkeys([*known.get(name, "").split(OR), unit])
+                known[name] = OR.join(one for one in several if one)
         for topic, widths in log.bits.items():
             bits[topic] = {**bits.get(topic, {}), **widths}
     kinds = {topic: kind for log in logs for topic, kind in log.kinds.items()}
@@ -80,7 +84,8 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
         notes: lines on units and on what was left out, which are appended.
 
     Raises:
-        ValueError: no such log, no database, a message or a signal that is not there; one line with the remedy.
+        ValueError: no such log, no database, a message or a signal that is not there, or whose unit differs from log
+            to log; one line with the remedy.
     """
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
@@ -96,7 +101,11 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
 
 
 def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
-    """Return the units of the signals of sources; raise ValueError where a message or a signal is not in the log."""
+    """Return the units of the signals of sources.
+
+    Raises:
+        ValueError: a message or a signal that is not in the log, a signal of another unit in another log.
+    """
     remedy = f"heliograph inspect {path} lists what there is"
     for topic in sources.topics:
         if topic not in log.units and not set("+#") & set(topic):
@@ -110,6 +119,8 @@ def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[s
                 if name not in signals and name != STAMP:
                     got = f"{_name_near(path_in_message, signals)}; {remedy}"
                     raise fail(f"{place}, {topic}", f"a signal {path_in_message!r} of the sources", got)
+                if OR in signals.get(name, "") and len(list_logs(path)) > 1:
+                    raise fail(f"{place}, {topic}", f"one unit of {name!r} in all logs", signals[name])
                 if signals.get(name):
                     used[f"{topic}.{name} in {signals[name]}"] = None
     return list(used)
