@@ -169,3 +169,13 @@ def test_of_several_links_judge_declared_says_what_judges_them():
         hg.simulation.judge_declared(centre(), np.zeros((50, 4)))
     assert hg.simulation.judge_declared_links(centre(), np.full((50, 4), np.nan)) == ()
     assert hg.simulation.judge_declared_links(hg.kalman_filter(ROAD, hg.LinearSensor([[1.0, 0.0]], 1.0)), [[0.0]]) == ()
+
+
+@pytest.mark.slow
+def test_what_no_scale_explains_is_said():
+    """One reading of 1e100: its likelihood is 0 for every scale in reach, and the judgement had no sentence at all."""
+    rows = fixes(3, 100, False, 0.5, 0.5)
+    rows[50, 0] = 1e100
+    judgement = hg.simulation.judge_declared(FILTER, rows)
+    (line,) = judgement.sentences()
+    assert judgement.contradicted and line.startswith("no scale explains the innovations")

@@ -133,7 +133,10 @@ class DeclaredJudgement:
                 "neither a scale of the declared variances nor a bias explains the innovations: correlated over one "
                 f"message ({self.refit_correlation:.2f}) after a refit, by something that the model forgets"
             ]
-        return [line for one in self.classes for line in _describe_scale(one, len(self.classes) > 1)]
+        lines = [line for one in self.classes for line in _describe_scale(one, len(self.classes) > 1)]
+        worst = max((one.nis for one in self.classes if not one.nis <= LEAST * one.nis_high), default=0.0)
+        unexplained = f"no scale explains the innovations, whose squares are {worst:.3g} times what is claimed"
+        return lines or [unexplained] * bool(worst)
 
 
 def judge_declared(

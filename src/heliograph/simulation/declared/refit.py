@@ -34,7 +34,7 @@ TIMES = (5.0, 50.0)  # steps: memories from which the search begins
 DIFFERENCE = 1e-4  # of logarithms, for slopes
 SLOPE = 3e-3  # nats for a factor of e in a number, at which it is at its best
 CLOSE = 0.05  # of a logarithm: as near as the end of an interval is found
-LOST = 1e12  # nats by which numbers that give no likelihood (NaN) are worse than any
+LOST = 1e12  # nats by which numbers that give no likelihood (NaN, or one of 0) are worse than any
 
 
 class DeclaredRows(NamedTuple):
@@ -303,7 +303,7 @@ def _maximise_likelihood(
         all_logs[free] = logs
         points = np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)])
         points = np.clip(points, low, high)  # flat beyond the limits
-        values = -np.nan_to_num(over_runs(likelihood, points), nan=-LOST)
+        values = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
 
