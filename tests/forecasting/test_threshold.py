@@ -104,3 +104,13 @@ def test_what_is_no_threshold_is_refused(name, level, said):
     plant, sensor = walk()
     with pytest.raises(ValueError, match=said):
         crossing(hg.kalman_filter(plant, sensor).run([[1.0]]), name, level, 3)
+
+
+def test_noise_of_a_sensor_does_not_depend_on_the_mode():
+    """x_2 / x_1 is 1 or 2 by the mode, each with probability 1/2: y_2 - x_2 has the mean 0 in both, to five errors."""
+    plant = hg.markov_plant([hg.LinearPlant([[a]], 1e-12, [1.0], 1e-12) for a in (1.0, 2.0)], np.full((2, 2), 0.5))
+    stream = hg.Stream(hg.filters.imm_filter(plant, hg.LinearSensor([[1.0]], 1.0), hg.perfect()))
+    paths = draw_paths(stream, 2, draws=DRAWS)
+    noise, second = (paths.y - paths.x)[:, 1, 0], paths.x[:, 1, 0] / paths.x[:, 0, 0] > 1.5
+    assert abs(second.mean() - 0.5) < 5 * np.sqrt(0.25 / DRAWS)
+    assert abs(noise[second].mean() - noise[~second].mean()) < 5 * np.sqrt(4 / DRAWS)

@@ -216,7 +216,7 @@ def _draw_from_starts(
         key_of_plant, key_of_sensor = jax.random.split(key_of_row)
         plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
         if switching is not None:
-            key_of_mode = jax.random.fold_in(key_of_row, 1)
+            key_of_mode = jax.random.fold_in(key_of_row, 2)  # 0 and 1 may be the keys of plant and sensor
             mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))
             plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
         x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(key_of_plant, u_k))
