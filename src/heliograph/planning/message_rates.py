@@ -244,12 +244,13 @@ def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _Cells:
     cells_of_delta = int(np.ceil(min(delta / (share * np.sqrt(min(q, r))), MOST_CELLS) - 0.5))
     h = delta / (cells_of_delta + 0.5)
     # As many as reach over HELD deviations of what is measured.
-    cells_each_side = int(np.ceil(min(HELD * np.sqrt(q / (1 - a * a) + r) / h, MOST_CELLS)))
+    measured = np.sqrt(q / (1 - a * a) + r)
+    cells_each_side = int(np.ceil(min(HELD * measured / h, MOST_CELLS)))
     if cells_each_side > POINTS:
         raise fail(
             "plant, sensor and delta",
             f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
-            f"{cells_each_side / 5.5:.3g} times",
+            f"{measured / min(np.sqrt(q), np.sqrt(r), delta):.3g} times",
         )
     return _Cells(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
 
