@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from heliograph.files.recording import Recording
-    from heliograph.forecasting import Score
     from heliograph.report.progress import Advance
     from heliograph.report.results import Results
     from heliograph.simulation.network import Network
@@ -102,7 +101,7 @@ def _parse_rows_ahead(horizons: str) -> list[int]:
     return rows_ahead
 
 
-def _describe_coverage(score: "Score") -> str:
+def _describe_coverage(score: "heliograph.forecasting.Score") -> str:
     """Return a line on how often what came was within the intervals of a forecast."""
     shares = ", ".join(f"{share.value:.1%} +- {share.error:.1%}" for share in score.coverage)
     return (

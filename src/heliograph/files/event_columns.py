@@ -27,7 +27,7 @@ class UnsetStamps(NamedTuple):
 
     note: str = ""  # on the clock
     reason: str = ""  # why events were removed
-    count: int = 0  # of those
+    removed: int = 0  # how many
 
 
 @dataclass
@@ -170,7 +170,7 @@ class NodeEvents:
         near = "that of arrival" if are_arrivals_known else "the others in order"
         why = fail(name, f"a time that was set, near {near}", f"{moment} in {count} of {len(time)} messages")
         self.keep_events(~unset)
-        return UnsetStamps(reason=str(why), count=count)
+        return UnsetStamps(reason=str(why), removed=count)
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
         """Note events with unset stamps as messages that came and are no events: moments near them, and counts.

@@ -186,7 +186,7 @@ class EventTable:
             self.notes += columns.describe_doubtful_count(f"{source}, {name}")
             if unset.reason:
                 self.refuse(InputError(unset.reason), strict)
-                self.refused += unset.count - 1  # one was counted with the reason
+                self.refused += unset.removed - 1  # one was counted with the reason
         # Without an event the first thing that went wrong is the error.
         if not len(self) and (first := (*self.reasons, self.broken)[0]):
             raise InputError(first)

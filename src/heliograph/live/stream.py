@@ -245,7 +245,7 @@ class Stream:
                     f"{u.tolist()}: {why}{self._name_faulty_function(u)}",
                 )
         if judgement.reason > 0:
-            why = Judgement.describe(judgement.reason, judgement.distance) + self._name_faulty_function(u)
+            why = Judgement.describe(float(judgement.reason), float(judgement.distance)) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         stepper.step(z, u, self.steps)  # anew, since zeros may have been tried in between
         stepper.accept()
