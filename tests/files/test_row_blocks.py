@@ -115,3 +115,15 @@ def test_parquet_in_blocks_of_any_size(tmp_path):
     pq.write_table(pa.table({"time": [1.0, 2, 3]}), path)
     list(tables.read_row_blocks(path, None, False, tables.BlockSize(rows=2), lambda *of: told.append(of)))
     assert told == [(2, 3), (3, 3)]
+
+
+def test_row_groups_that_were_read_are_let_go(tmp_path):
+    """Of 40 groups of 80 kB at most a few are in memory at a time; all of them were, where Arrow buffers ahead."""
+    groups, rows = 40, 10_000
+    table = pa.table({"time": np.arange(groups * rows, dtype=float)})
+    pq.write_table(table, tmp_path / "data.parquet", row_group_size=rows, compression="none", use_dictionary=False)
+    del table
+    before, most = pa.total_allocated_bytes(), 0
+    for _ in tables.read_row_blocks(tmp_path / "data.parquet", None, False, tables.BlockSize(rows=rows)):
+        most = max(most, pa.total_allocated_bytes() - before)
+    assert most < groups / 4 * rows * 8
