@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.roots import covariance_of_root, roots_of
-from heliograph.linear.recursion import RecursionStep, step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, roots_of
+from heliograph.linear.lmmse_recursion import RecursionStep, step_covariance, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.random_affine.moments.monomials import position
 

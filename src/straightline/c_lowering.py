@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.folding import is_finite
+from straightline.constant_folding import is_finite
 from straightline.graph import Graph
-from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, Value, arrange_nodes, type_of
-from straightline.memory import InMemory
 from straightline.nodes import REAL, Buffer, Node, Type
+from straightline.size_limits import LOADED
+from straightline.strided_arrays import InMemory
 
 # Finite where the arguments are, but for overflow and divisions by zero.
 PRESERVING = frozenset((

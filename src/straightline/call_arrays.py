@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from straightline.llvm.layout import LINE
+from straightline.llvm.memory_layout import LINE
 from straightline.result_memory import align_to_line
 
 

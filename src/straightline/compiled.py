@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import PyTree
 
 from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
-from straightline.folding import DTYPES
-from straightline.limits import ALONE, LITTLE, LONGEST
-from straightline.llvm.module import ModuleText, write_module
-from straightline.machine import Machine, TieredCode, choose_hasty_width, find_processor_features, generate
+from straightline.constant_folding import DTYPES
+from straightline.llvm.module_text import ModuleText, write_module
+from straightline.machine_code import Machine, TieredCode, choose_hasty_width, find_processor_features, generate
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
 from straightline.result_memory import make_aligned_array
+from straightline.size_limits import ALONE, LITTLE, LONGEST
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from straightline.folding import COMMUTATIVE, DTYPES, fold_node
-from straightline.limits import LONGEST
+from straightline.constant_folding import COMMUTATIVE, DTYPES, fold_node
 from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
+from straightline.size_limits import LONGEST
 
 
 class Graph:

@@ -19,9 +19,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import PyTree
 
 from straightline.graph import Graph
-from straightline.limits import LONGEST, TABLE, WRITTEN_OUT
-from straightline.memory import InMemory
 from straightline.nodes import TYPES, Buffer, Node, RandomKey, Type, Unsupported
+from straightline.size_limits import LONGEST, TABLE, WRITTEN_OUT
+from straightline.strided_arrays import InMemory
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory
 Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]

@@ -15,29 +15,29 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
-from straightline.folding import DTYPES
+from straightline.constant_folding import DTYPES
 from straightline.graph import Graph
-from straightline.limits import LONGEST, TABLE
 from straightline.lowering import Lowering, Value, arrange_nodes, make_keys, trace_function, type_of
-from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
-    calls,
+    calls_and_branches,
+    custom_operations,
     decompositions,
     elementwise,
-    indexing,
+    gather,
+    long_arrays,
     loops,
     matrices,
-    named,
-    present,
+    never_nan_marks,
     random_bits,
-    rows,
     scatter,
     shapes,
     sorting,
-    special,
+    special_functions,
     views,
 )
+from straightline.size_limits import LONGEST, TABLE
+from straightline.strided_arrays import InMemory
 
 
 class Program(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from straightline.llvm.layout import LINE
+from straightline.llvm.memory_layout import LINE
 
 LEAST = 1 << 17  # bytes of an array below which the library of C has memory at hand
 MOST = 1 << 28  # bytes that a process keeps: what was kept first goes back to the system

@@ -7,9 +7,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.engine.choice import engine_of
-from straightline import machine
+from straightline import machine_code
 from straightline.compiled import Compiled, SingleRunCode, compile
-from straightline.jax_function import make_jax_function
+from straightline.graph_as_jax_function import make_jax_function
 from straightline.program import lower_function
 
 RANDOM = np.random.default_rng(4)
@@ -372,8 +372,8 @@ def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypa
         raise RuntimeError("no target for this processor")
 
     x = RANDOM.normal(size=(3, 2, 2))
-    monkeypatch.setattr(machine.llvm.Target, "from_default_triple", unknown)
-    for cached in (machine.find_llvm_target, machine.find_processor_features):
+    monkeypatch.setattr(machine_code.llvm.Target, "from_default_triple", unknown)
+    for cached in (machine_code.find_llvm_target, machine_code.find_processor_features):
         cached.cache_clear()
     with pytest.warns(RuntimeWarning, match="no native code: expected a processor that LLVM knows, got no target"):
         assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.known_losses import find_eigenspaces, find_fastest_unobserved_mode, is_excited_by_noise
+from heliograph.linear.known_loss_stability import find_eigenspaces, find_fastest_unobserved_mode, is_excited_by_noise
 
 NONE = np.zeros((0, 2))
 INDEPENDENT = np.array([[0.3, 0.7]] * 2)

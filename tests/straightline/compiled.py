@@ -6,8 +6,8 @@ from collections.abc import Iterable
 import llvmlite.binding as llvm
 import numpy as np
 
-from straightline.llvm.lanes import write_types
-from straightline.vectors.elementary import write_functions
+from straightline.llvm.vector_types_and_gathers import write_types
+from straightline.vectors.elementary_functions import write_functions
 
 WIDTH = 8
 

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from heliograph.engine.limits import SHORT
+from heliograph.engine.size_thresholds import SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.numerics.process.interpreter_stack import reserve_stack
 from heliograph.numerics.trace_settings import trace_settings
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile
 

@@ -7,8 +7,8 @@ its mean beside the center; here it becomes a mean on the group, and its covaria
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.numerics.manifold import Manifold
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.factors.columns import is_positive, reciprocal_or_one
-from heliograph.factors.repeated import noise_beside_rounding, rounding_of_products
+from heliograph.factors.covariance_factors import is_positive, reciprocal_or_one
+from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN
 from heliograph.numerics.trace_settings import writes_short_programs
 

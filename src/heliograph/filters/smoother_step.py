@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
-from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
+from heliograph.factors.factored_gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.factors.gaussian_on_group import settle, unsettle
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits

@@ -17,7 +17,7 @@ import numpy as np
 
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, Int
 
 Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a first axis

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
-from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
-from heliograph.linear.recursion import step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
+from heliograph.linear.known_loss_stability import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
+from heliograph.linear.lmmse_recursion import step_covariance, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs

@@ -25,7 +25,7 @@ from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.program_text import hash_numbers, write_program_text
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
 

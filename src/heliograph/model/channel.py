@@ -16,10 +16,9 @@ from heliograph.model.turn_invariance import check_turns
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.manifold import Manifold
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.delay import (
     Delay,
     Delayed,
@@ -29,12 +28,13 @@ from heliograph.random_affine.delay import (
 )
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.law import AbstractLaw, Constant, LawLike
-from heliograph.random_affine.memory import separate_memories
+from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.memories_of_channels import separate_memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.sum_of_maps import Superposed
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 

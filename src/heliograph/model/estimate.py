@@ -11,8 +11,8 @@ from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.words.rounded import find_rounded
+from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.words.rounding_noise import find_rounded
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}

@@ -17,10 +17,10 @@ from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, are_same
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.memory import AbstractWithMemory, memories, select_alike
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
+from heliograph.random_affine.memories_of_channels import AbstractWithMemory, memories, select_alike
 from heliograph.random_affine.noise import AbstractNoise, Square, Vector
 
 Transition = MarkovChain | ArrayLike  # a chain, or its probabilities (modes, modes)

@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, covariance, error_text, fail, funct
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import as_real, trace_shape
+from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,

@@ -15,13 +15,7 @@ from heliograph.numerics.check import array, fail, flag, instance, name_list, sc
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.law import AbstractLaw
-from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.reported_law import (
+from heliograph.random_affine.channel_state_information import (
     FreshNumbers,
     FreshReading,
     PilotedHop,
@@ -29,6 +23,12 @@ from heliograph.random_affine.reported_law import (
     ToldMap,
     told_maps,
 )
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.gain_laws import AbstractLaw
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
+from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.series_and_stack import Stack
 
 M = TypeVar("M", bound=AbstractRandomAffine)
 

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.traced import is_traced, warn_of_single
+from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.numpy_or_jax import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
 
 

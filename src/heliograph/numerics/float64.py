@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.process.garbage_collector import pause_collector
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it

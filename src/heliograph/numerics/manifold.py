@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.angle import Angles, continue_angles, wrap_angles, wrap_near
-from heliograph.numerics.rotation import turn, turn_between
+from heliograph.numerics.rotation_vectors import turn, turn_between
 from heliograph.numerics.types import Array
 
 A = TypeVar("A", jax.Array, np.ndarray)

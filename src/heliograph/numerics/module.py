@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.float64 import let_compute_in_float64
-from heliograph.numerics.names import refuse_attribute
+from heliograph.numerics.lazy_exports import refuse_attribute
 
 
 def are_same(x: Any, y: Any) -> bool:

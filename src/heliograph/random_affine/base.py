@@ -10,16 +10,16 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.module import Module, are_same, readable, unwritten
-from heliograph.numerics.traced import is_traced, stack_parts
+from heliograph.numerics.numpy_or_jax import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
-from heliograph.random_affine.memory import (
+from heliograph.random_affine.memories_of_channels import (
     AbstractWithMemory,
     draw_with_shared_memories,
     init_with_shared_memories,
     memories,
 )
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
-from heliograph.random_affine.moments.intervals import CORNERS, Interval
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain
+from heliograph.random_affine.moments.interval_products import CORNERS, Interval
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, give_moments
 from heliograph.random_affine.moments.signal_path import (

@@ -15,15 +15,15 @@ from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps, replace_inner_maps
-from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.law import Discrete
+from heliograph.random_affine.laws.gain_laws import Discrete
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.series_and_stack import Series, Stack
 
 # Steps; their law at each step; or a chain whose mode is the number of steps.
 Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)

@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.traced import plain
+from heliograph.numerics.numpy_or_jax import plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome, check_maps
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, percent_in_words

@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.traced import library, stack_parts
+from heliograph.numerics.numpy_or_jax import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.combine import AbstractCombination, Corners
 from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
-from heliograph.random_affine.laws.law import Constant, Discrete
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
+from heliograph.random_affine.laws.gain_laws import Constant, Discrete
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, product_table
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import Gaussian, Matrix
+from heliograph.random_affine.series_and_stack import AbstractCombination, Corners
 
 
 class Mixture(AbstractUniform, AbstractCombination):

@@ -13,14 +13,21 @@ import numpy as np
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library, stack_parts
+from heliograph.numerics.numpy_or_jax import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, MemoryStates, Rows
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractUniform
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
-from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.memory import condition_on_states, memories, select_alike
+from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.markov_chain_and_autoregression import (
+    AbstractMemory,
+    Autoregression,
+    Law,
+    MarkovChain,
+    MemoryStates,
+    Rows,
+)
+from heliograph.random_affine.memories_of_channels import condition_on_states, memories, select_alike
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit

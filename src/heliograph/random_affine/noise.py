@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.columns import WeightedColumns, columns_of, eliminate, square_root
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, eliminate, square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.laws.law import draw_index
+from heliograph.random_affine.laws.gain_laws import draw_index
 from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
     NoiseAtom,

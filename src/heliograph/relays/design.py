@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.linear.jump_system import propagate_by_mode
-from heliograph.linear.recursion import lmmse
+from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import lower_by_noise

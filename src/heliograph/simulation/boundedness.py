@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import scipy
 
-from heliograph.linear.known_losses import (
+from heliograph.linear.known_loss_stability import (
     BELOW_ONE,
     KindGains,
     KnownLossSystem,
@@ -30,7 +30,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes, long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

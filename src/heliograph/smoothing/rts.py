@@ -13,9 +13,9 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import data_free_smoother_steps, plan_with_past, step_rows
-from heliograph.smoothing.chunks import smooth_in_chunks
+from heliograph.smoothing.chunked_smoother import smooth_in_chunks
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, FixedInterval, warn_if_inconsistent
+from heliograph.smoothing.forward_and_backward_pass import data_free_smoother_steps, plan_with_past, step_rows
 
 
 @readable

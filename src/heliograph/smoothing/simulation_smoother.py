@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import square_root
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.covariance_factors import square_root
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
@@ -13,7 +13,7 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import step_rows, take_step, take_steps
+from heliograph.smoothing.forward_and_backward_pass import step_rows, take_step, take_steps
 
 
 def simulation_smoother(

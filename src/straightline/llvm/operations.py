@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable
 
 from straightline.nodes import REAL, Node, Type, Unsupported
-from straightline.vectors.elementary import FUNCTIONS, SCALAR
+from straightline.vectors.elementary_functions import FUNCTIONS, SCALAR
 
 LLVM = {"f64": "double", "f32": "float", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
 BITS = {"f64": 64, "f32": 32, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory

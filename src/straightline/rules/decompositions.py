@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.limits import FEW
 from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, make_placeholder, result_shape
 from straightline.nodes import Unsupported
+from straightline.size_limits import FEW
 
 SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
 Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column

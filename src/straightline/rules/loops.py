@@ -9,11 +9,11 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import WRITTEN_OUT
 from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, list_nodes
-from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Loop, LoopExit, Node, RandomKey, Type, Unsupported
 from straightline.rules.elementwise import select
+from straightline.size_limits import WRITTEN_OUT
+from straightline.strided_arrays import InMemory
 
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 

@@ -10,11 +10,11 @@ from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
 from straightline.graph import Graph
-from straightline.limits import WRITTEN_OUT
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.places import convert_to_32_bits, fills_outside, find_window_places
+from straightline.rules.index_bounds import convert_to_32_bits, fills_outside, find_window_places
+from straightline.size_limits import WRITTEN_OUT
 
 
 def _make_scatter_rule(op: str | None) -> Rule:

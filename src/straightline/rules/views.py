@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import FEW, LOADED, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, arrange_nodes, result_shape
-from straightline.memory import InMemory, contiguous_strides
 from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
+from straightline.rules.index_bounds import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_filling
 from straightline.rules.loops import copy_in_memory, put_in_memory, repeat_turns
-from straightline.rules.places import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_filling
 from straightline.rules.shapes import select_array
+from straightline.size_limits import FEW, LOADED, TABLE
+from straightline.strided_arrays import InMemory, contiguous_strides
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 

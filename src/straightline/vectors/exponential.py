@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select
+from straightline.vectors.formula_builder import Vector, copy_sign, fma, polynomial, select
 
 LOG2_E = 1 / math.log(2)
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.factors.roots import covariance_of_root, roots_of
-from heliograph.linear.recursion import step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, roots_of
+from heliograph.linear.lmmse_recursion import step_covariance, take_noise_roots
 from heliograph.linear.system import LinearSystem, state_moments
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float

@@ -10,9 +10,9 @@ import pytest
 
 from straightline.c_source import CSource, write_literal
 from straightline.lowering import list_nodes
-from straightline.memory import InMemory
 from straightline.nodes import Unsupported
 from straightline.program import lower_function
+from straightline.strided_arrays import InMemory
 from tests.export.device import needs_compiler
 from tests.straightline.conformance.c import FLAGS
 

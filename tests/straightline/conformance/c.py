@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from straightline.c_source import CSource, c_type
-from straightline.folding import DTYPES
+from straightline.constant_folding import DTYPES
 from straightline.lowering import list_nodes
 from straightline.nodes import Unsupported
 from tests.straightline.conformance.case import Case

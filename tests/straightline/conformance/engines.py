@@ -7,11 +7,11 @@ import jax
 import numpy as np
 
 from straightline.compiled import Compiled
-from straightline.limits import TABLE
 from straightline.lowering import Lowering, trace_function, type_of
-from straightline.memory import InMemory
 from straightline.nodes import Buffer
 from straightline.program import Program, lower_function
+from straightline.size_limits import TABLE
+from straightline.strided_arrays import InMemory
 from tests.straightline.conformance.case import Case
 
 

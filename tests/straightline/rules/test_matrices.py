@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from straightline.compiled import compile
-from straightline.jax_function import make_jax_function
-from straightline.llvm.module import choose_output_buffers
+from straightline.graph_as_jax_function import make_jax_function
+from straightline.llvm.module_text import choose_output_buffers
 from straightline.nodes import Node
 from straightline.program import list_needed, lower_function
 

@@ -18,7 +18,7 @@ from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.memory import is_modal
+from heliograph.random_affine.memories_of_channels import is_modal
 from heliograph.random_affine.moments.second_moments import has_random_gain
 
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"

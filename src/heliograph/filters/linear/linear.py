@@ -40,10 +40,10 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
-from heliograph.random_affine.memory import is_modal
+from heliograph.random_affine.memories_of_channels import is_modal
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
-from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.words.rounded import find_rounded
+from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.words.rounding_noise import find_rounded
 
 
 class LinearFilter(AbstractSizedFilter):

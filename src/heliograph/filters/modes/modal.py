@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import (
+from heliograph.factors.covariance_factors import (
     WeightedColumns,
     below_diagonal,
     join_columns,
@@ -27,7 +27,7 @@ from heliograph.factors.columns import (
     side_by_side,
     triangularise,
 )
-from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
@@ -51,9 +51,9 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import stack_parts
+from heliograph.numerics.numpy_or_jax import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
 

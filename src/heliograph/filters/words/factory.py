@@ -22,11 +22,11 @@ from heliograph.model.words.encoder import Dither, Words
 from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.delay import Delayed
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded
 
 
 class WordAlphabet(NamedTuple):

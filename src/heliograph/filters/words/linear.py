@@ -28,7 +28,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded
 
 SEEN = 0.01  # share of the rms error that overload may change a claim by
 MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.filters.base import (
     AbstractFilter,
     Step,
@@ -36,10 +36,10 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.delay import Delayed, Relayed, place_on_delay_line, signal_size
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.series_and_stack import Series
 
 
 class PartFilter(AbstractWrapper):

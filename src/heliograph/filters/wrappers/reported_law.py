@@ -32,17 +32,17 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.reported_law import (
+from heliograph.random_affine.channel_state_information import (
     believe_told,
     make_certain,
     numbers_give_law,
     numbers_of_outputs,
     told_maps,
 )
+from heliograph.random_affine.moments.second_moments import second_order
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 

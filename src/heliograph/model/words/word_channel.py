@@ -14,13 +14,13 @@ from heliograph.model.over_time import at_each_step, first
 from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import AbstractUniform
 from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.words.flips import Flips
+from heliograph.random_affine.series_and_stack import Series, Stack
+from heliograph.random_affine.words.bit_flips import Flips
 
 FLAG = -1  # in the place of a component: a number that is no word
 Places = tuple[int, ...]  # of words: the component that each carries

@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 
 NANOSECONDS = np.dtype("datetime64[ns]")

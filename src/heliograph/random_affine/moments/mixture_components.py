@@ -7,9 +7,9 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import jax
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import Array, Float
 
 COMPONENT_LIMIT = 4096  # combinations of atoms held for one step

@@ -17,7 +17,7 @@ import numpy as np
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import scatter
+from heliograph.numerics.numpy_or_jax import scatter
 from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number

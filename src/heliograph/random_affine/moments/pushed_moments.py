@@ -13,10 +13,9 @@ import numpy as np
 
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import is_traced, plain, stack_parts
+from heliograph.numerics.numpy_or_jax import is_traced, plain, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise, affine_matrix, gain_moments
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import (
@@ -30,6 +29,7 @@ from heliograph.random_affine.moments.monomials import (
     symmetric_power,
 )
 from heliograph.random_affine.noise import AbstractNoise, Number, noise_vector
+from heliograph.random_affine.series_and_stack import Series
 
 Array1 = Float[jax.Array | np.ndarray, " n"]
 Array2 = Float[jax.Array | np.ndarray, "n m"]

@@ -7,16 +7,21 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, columns_of
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.moments.intervals import CORNERS
+from heliograph.random_affine.moments.interval_products import CORNERS
+from heliograph.random_affine.moments.moment_tensors import (
+    Matrix,
+    Tensor,
+    drop_constant,
+    symmetric_product,
+)
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, JointMoments
-from heliograph.random_affine.moments.quadratic_map import (
+from heliograph.random_affine.moments.second_moment_map import (
     QuadraticMap,
     add_maps,
     map_of_known_law,
@@ -25,19 +30,14 @@ from heliograph.random_affine.moments.quadratic_map import (
     signal_of_map,
     size_of_map,
 )
-from heliograph.random_affine.moments.tensors import (
-    Matrix,
-    Tensor,
-    drop_constant,
-    symmetric_product,
-)
-from heliograph.random_affine.moments.uncertain_law import (
+from heliograph.random_affine.moments.uncertain_law_bounds import (
     PROPORTIONAL_TOLERANCE,
     bound_all_laws,
     bound_from_intervals,
     tensors_of_law,
 )
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.sum_of_maps import Superposed
 
 
 class SecondOrder(Module):

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.moments.monomials import JointMoments
 

@@ -17,7 +17,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance, spread_over_names
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library, plain
+from heliograph.numerics.numpy_or_jax import library, plain
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps
 from heliograph.random_affine.delay import Delayed, signal_size

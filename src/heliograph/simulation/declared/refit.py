@@ -21,8 +21,14 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.channel_state_information import (
+    AbstractTold,
+    ToldGainHop,
+    ToldMap,
+    numbers_of_outputs,
+    told_maps,
+)
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.reported_law import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 

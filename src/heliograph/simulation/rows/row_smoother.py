@@ -21,7 +21,7 @@ from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail, instance, is_whole, show_value
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network

@@ -13,9 +13,9 @@ from heliograph.filters.remark import Remark
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.flat import FlatLayout, flatten_to_row, make_flat_layout
+from heliograph.numerics.trees.flattened_trees import FlatLayout, flatten_to_row, make_flat_layout
 from heliograph.numerics.trees.program_text import write_program_text
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.description.remarks import find_remarking, list_remarks
 from heliograph.simulation.network import Network

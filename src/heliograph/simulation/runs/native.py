@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import try_native
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.arguments import Precision

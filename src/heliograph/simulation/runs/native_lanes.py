@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.engine.choice import get_thread_pool
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.runs.lanes import LANES, count_runs_by_batch
 from heliograph.simulation.smoothed import ReducedRuns

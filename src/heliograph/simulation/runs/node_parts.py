@@ -12,7 +12,7 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import drop_identities
+from heliograph.random_affine.memories_of_channels import drop_identities
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_index import FilterKind, find_estimate_places
 from heliograph.simulation.node import Node

@@ -1,0 +1,305 @@
+"""Laws of a scalar gain: each samples itself and knows its moments E[g^k].
+
+A law may be known only roughly: its probabilities may move within |dp| <= radius, sum dp = 0, 0 <= p + dp <= 1. Then
+`moment` is nominal, and `extremes` lists the laws at the corners of that polytope, among which every expectation that
+is linear in p has its worst case.
+"""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.numerics import check
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.check import array, fail, radii, scalar
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.module import Module, are_same, readable, unwritten
+from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, plain, stack_parts, within
+from heliograph.numerics.types import ArrayLike, Float
+
+Scalar = Float[jax.Array | np.ndarray, ""]
+Vector = Float[jax.Array | np.ndarray, " n"]
+
+DRAWS = 2**14  # of a law that nobody knows but by its samples
+NATS = 36.0  # e^-36 is a rounding error of 1
+BEYOND = 1e-12  # by which a corner's last probability may lie beyond its ends, for the rounding of the others' sum
+CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
+
+
+def draw_index(probabilities: Vector, key: jax.Array) -> jax.Array:
+    """Draw one of finitely many: invert the distribution function at a uniform draw."""
+    return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(jnp.asarray(probabilities))[:-1])
+
+
+@readable
+class AbstractLaw(Module):
+    """A law of a real random gain, independent over time.
+
+    Its parameters are numbers, or traced by JAX: then so are its moments.
+    """
+
+    formulas = "constant", "moment", "extremes", "corner_moments", "moment_interval", "list_atoms", "quantile", "bulk"
+
+    @property
+    def constant(self) -> Scalar | None:
+        """The gain where it is one number; None where it is random."""
+        return None
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw one gain; shape ()."""
+        raise unwritten(self, "sample")
+
+    def moment(self, order: int) -> float | jax.Array:
+        """Return E[g^order] under the nominal law; traced where the law's parameters are."""
+        raise unwritten(self, "moment")
+
+    def extremes(self) -> tuple["AbstractLaw", ...]:
+        """Return the laws at the corners of the set of possible laws; the law itself when it is known."""
+        return (self,)
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
+        """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        return stack_parts([stack_parts([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
+
+    def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
+        """Return the lowest and highest E[g^order] over the possible laws, those of the `extremes`."""
+        ends = self.corner_moments(order)[:, order]
+        return plain(ends.min()), plain(ends.max())
+
+    def covers(self, own: "AbstractLaw") -> bool:
+        """Decide whether another law, with all that it may be, is one of those that this one may be."""
+        return are_same(self, own)
+
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """Return probability and value of each of finitely many gains; by default a refusal."""
+        raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
+
+    def quantile(self, probability: Vector) -> np.ndarray:
+        """Return the gains below which these probabilities lie; by default those of DRAWS samples.
+
+        Raises:
+            ValueError: a law that cannot be sampled.
+        """
+        return np.asarray(np.quantile(self._draw_values(), probability))
+
+    @in_float64
+    def _draw_values(self) -> np.ndarray:
+        """Draw DRAWS gains."""
+        values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
+        return values
+
+    @property
+    def logarithmic(self) -> bool:
+        """True of a positive gain whose law is wide on a logarithmic scale."""
+        return False
+
+    def log_density(self, g: jax.Array) -> jax.Array:
+        """Return log p(g) but for a constant, of a positive gain that has a density."""
+        raise unwritten(self, "log_density")
+
+    def bulk(self) -> "tuple[Scalar | float, Scalar | float]":
+        """Return gains between which all of the law lies but a share of e^-36."""
+        raise unwritten(self, "bulk")
+
+    def mean_law(self) -> "Constant":
+        """Return the constant law at E[g], for a filter that takes the mean gain as the true one."""
+        return Constant(self.moment(1))
+
+
+LawLike = TypeAliasType("LawLike", AbstractLaw | ArrayLike)  # a law, or a gain that is certain
+
+
+class Constant(AbstractLaw):
+    """A gain that is always `value`."""
+
+    value: Scalar
+
+    def __init__(self, value: "Float[ArrayLike, '']"):
+        self.value = scalar("constant gain", value)
+
+    @property
+    def constant(self) -> Scalar:
+        """The one value that the gain has."""
+        return self.value
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Return the value; the key is unused."""
+        return jnp.asarray(self.value)
+
+    def moment(self, order: int) -> float | jax.Array:
+        """Return value^order."""
+        return plain(self.value**order)
+
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """Return the value, which is certain."""
+        return [(1.0, plain(self.value))]
+
+
+class Discrete(AbstractLaw):
+    """Gains `values` with `probabilities`, each known within its `radius`."""
+
+    values: Vector
+    probabilities: Vector
+    radius: np.ndarray
+
+    def __init__(self, values: ArrayLike, probabilities: ArrayLike, radius: ArrayLike = 0.0):
+        self.values = array("gain values", values, (None,))
+        self.probabilities = check.probabilities("gain probabilities", probabilities, len(self.values))
+        self.radius = radii("probability radius", radius, self.probabilities)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw one of the values, by inverting the distribution function at a uniform draw."""
+        return jnp.asarray(self.values)[draw_index(self.probabilities, key)]
+
+    def moment(self, order: int) -> float | jax.Array:
+        """Return sum_i p_i v_i^order."""
+        return plain(self.probabilities @ self.values**order)
+
+    def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
+        """Return the lowest and highest E[g^order], also where the corners are too many to list."""
+        powers = self.values**order
+        return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
+
+    def covers(self, own: AbstractLaw) -> bool:
+        """Decide whether another law has the same values, and its probabilities stay within the radius."""
+        if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
+            return are_same(self, own)
+        return within(own.probabilities, own.radius, self.probabilities, self.radius)
+
+    def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
+        """Return the values, with their probabilities."""
+        return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
+
+    def worst(self, payoff: ArrayLike) -> float:
+        """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
+
+        Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the
+        fractional knapsack, which solves this linear programme).
+        """
+        gain = array("payoff", payoff, self.values.shape)
+        low = np.maximum(self.probabilities - self.radius, 0.0)
+        high = np.minimum(self.probabilities + self.radius, 1.0)
+        mass, total = 1.0 - low.sum(), float(low @ gain)
+        for i in np.argsort(-gain, kind="stable"):
+            added = min(mass, high[i] - low[i])
+            total, mass = total + added * gain[i], mass - added
+        return total
+
+    def extremes(self) -> tuple[AbstractLaw, ...]:
+        """Return the laws at all corners of the polytope.
+
+        Raises:
+            ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
+        """
+        return tuple(Discrete(self.values, corner) for corner in self.corners())
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
+        """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        corners = self.corners()
+        return stack_parts([corners @ self.values**k for k in range(order + 1)]).T
+
+    @cache_by_object
+    def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
+        """Return the corners of the polytope of probabilities, one in each row, with every value's probability.
+
+        The polytope: each probability within its radius and in [0, 1], the sum 1. At a corner each but one of the
+        uncertain probabilities is at an end of its interval.
+
+        Raises:
+            ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
+        """
+        free = np.flatnonzero(self.radius > 0)
+        if len(free) < 2:  # a single uncertain probability cannot move: the known ones leave it the rest of the sum 1
+            return self.probabilities[None]
+        if len(free) > CORNER_LIMIT:
+            raise fail("uncertain probabilities of one gain", f"at most {CORNER_LIMIT}", len(free))
+        low = np.maximum(self.probabilities - self.radius, 0.0)
+        high = np.minimum(self.probabilities + self.radius, 1.0)
+        corners = set()
+        # A vertex has all uncertain probabilities but one at an end; the one left makes the sum 1.
+        for slack in free:
+            others = [i for i in free if i != slack]
+            for ends in product(*((low[i], high[i]) for i in others)):
+                corner = self.probabilities.copy()
+                corner[others] = ends
+                corner[slack] = 0.0  # not counted in the sum of the others
+                corner[slack] = 1.0 - corner.sum()
+                if low[slack] - BEYOND <= corner[slack] <= high[slack] + BEYOND:
+                    corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
+        # Rounded, so that each corner is found once; then of sum 1 again.
+        return np.array([np.array(corner) / sum(corner) for corner in sorted(corners)])
+
+
+class CertainDiscrete(Discrete):
+    """Gains of finitely many values whose probabilities are certain, also where all numbers are traced.
+
+    Raises:
+        ValueError: a law whose probabilities may be off.
+    """
+
+    def __init__(self, law: Discrete):
+        if np.any(law.radius > 0):
+            raise fail("probabilities of a gain", "known ones, beside what a message tells", "uncertain ones")
+        self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
+
+    def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
+        """Return the probabilities alone."""
+        return self.probabilities[None]
+
+
+def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']" = 0.0) -> Discrete:
+    """Return the law of a link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
+
+    Args:
+        probability: P(gain 1), from 0 to 1.
+        radius: how far the probability may be off, 0 unless given.
+
+    Raises:
+        ValueError: a probability outside [0, 1], or a radius that it does not allow.
+    """
+    p = scalar("probability that a link works", probability, 0.0, 1.0)
+    return Discrete([0.0, 1.0], [1 - p, p], radius)
+
+
+class GivenMoments(AbstractLaw):
+    """Law of a gain of which only the moments are known, from measurements or from a data sheet.
+
+    It designs filters but cannot be sampled: many laws share these moments.
+
+    Args:
+        moments: E[g], E[g^2], ..., shape (order,).
+
+    Raises:
+        ValueError: no distribution on the real line has these moments (a Hankel matrix is indefinite), or a moment of
+            higher order than given is asked for.
+    """
+
+    moments: Vector
+
+    def __init__(self, moments: "Float[ArrayLike, ' order']"):
+        self.moments = array("gain moments", moments, (None,))
+        if is_traced(self.moments):
+            return
+        sequence = np.concatenate([[1.0], self.moments])
+        half = (len(sequence) - 1) // 2
+        # Moments of a distribution have a positive semidefinite Hankel matrix E[V V'], V = (1, g, g^2, ...).
+        hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
+        scale = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
+        smallest = np.linalg.eigvalsh(hankel / np.outer(scale, scale))[0]
+        if np.any(np.diag(hankel) < 0) or smallest < -1e-10:  # rounding of a correlation matrix
+            raise fail("gain moments", "those of some distribution", f"{self.moments.tolist()}, which none has")
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Refuse: the law itself is unknown."""
+        raise fail("simulating a gain known by its moments only", "a law that can be sampled", "GivenMoments")
+
+    def moment(self, order: int) -> float | jax.Array:
+        """Return the given E[g^order]."""
+        if order == 0:
+            return 1.0
+        if order > len(self.moments):
+            raise fail("gain moments", f"moments up to order {order}", f"{len(self.moments)} of them")
+        return plain(self.moments[order - 1])
