@@ -63,7 +63,7 @@ def rounded_more(item: hg.Network, index: int) -> Any:
         return (*find_processor_features()[:2], False)
 
     def forget() -> None:
-        for programs in (runs._find_program, choice._compile_structure):
+        for programs in (runs._find_program, choice._compile_for_structure):
             programs.cache_clear()
 
     forget()

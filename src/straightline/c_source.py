@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type, Unsupported
-from straightline.program import list_needed
+from straightline.program import list_needed_items
 
 Real = Literal["double", "float"]
 
@@ -194,7 +194,7 @@ class CSource:
         `real` is the type of numbers, and `prefix` begins the tables' names.
         """
         self.places, self.real, self.prefix = places, real, prefix
-        self.needed = list_needed(roots)
+        self.needed = list_needed_items(roots)
         self.names: dict[Node, str] = {}  # variable of each node that is computed
         self.arrays: dict[Buffer, str] = {}  # local array of each buffer that is filled
         self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}  # name and definition, by type and numbers

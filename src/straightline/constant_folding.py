@@ -304,7 +304,7 @@ def _fold_select(graph: NodeMaker, type: Type, condition: Node, a: Node, b: Node
     return None
 
 
-def _fold_comparison(op: str) -> Callable[..., Node | None]:
+def _make_equality_rule(op: str) -> Callable[..., Node | None]:
     """Return the rule that simplifies == or !=."""
 
     def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
@@ -323,7 +323,7 @@ def _fold_comparison(op: str) -> Callable[..., Node | None]:
     return fold_flag_comparison
 
 
-def _fold_order(strict: bool, turned: bool) -> Callable[..., Node | None]:
+def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | None]:
     """Return the rule that writes an order of flags as logic; `strict`: < rather than <=, `turned`: > for <."""
 
     def fold_flag_order(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
@@ -352,7 +352,7 @@ SIMPLER: dict[str, Callable[..., Node | None]] = {
     "add": _fold_add, "sub": _fold_sub, "mul": _fold_mul, "div": _fold_div, "neg": _fold_neg,
     "and": _fold_and, "or": _fold_or, "xor": _fold_xor, "not": _fold_not, "select": _fold_select,
     "shift_left": _fold_shift, "shift_right": _fold_shift, "max": _fold_extremum, "min": _fold_extremum,
-    "eq": _fold_comparison("eq"), "ne": _fold_comparison("ne"), "convert": _fold_convert,
-    "lt": _fold_order(True, False), "le": _fold_order(False, False),
-    "gt": _fold_order(True, True), "ge": _fold_order(False, True),
+    "eq": _make_equality_rule("eq"), "ne": _make_equality_rule("ne"), "convert": _fold_convert,
+    "lt": _make_flag_order_rule(True, False), "le": _make_flag_order_rule(False, False),
+    "gt": _make_flag_order_rule(True, True), "ge": _make_flag_order_rule(False, True),
 }  # fmt: skip

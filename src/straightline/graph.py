@@ -52,7 +52,7 @@ class Graph:
         return Node(op, type, args, block, value, self.serial)
 
     @contextmanager
-    def at_most(self, count: int) -> Iterator[None]:
+    def limit_new_nodes(self, count: int) -> Iterator[None]:
         """Allow so many more nodes; if there are more, which is refused, the block that was open is open again."""
         before, block = self.max_nodes, self.current
         self.max_nodes = min(before, self.serial + count)

@@ -14,9 +14,9 @@ from jaxtyping import PyTree
 
 from straightline.constant_folding import DTYPES
 from straightline.nodes import Block, Buffer, Guard, Loop, LoopExit, Node, Store, Unsupported
-from straightline.program import Program, list_needed
+from straightline.program import Program, list_needed_items
 from straightline.rules.random_bits import hash_words
-from straightline.strided_arrays import InMemory
+from straightline.strided_arrays import StridedArray
 
 lax = jax.lax
 OPERATIONS: dict[str, Callable[..., jax.Array]] = {
@@ -39,10 +39,10 @@ class _JaxEvaluation:
 
     def __init__(self, program: Program):
         self.program = program
-        nodes = [n for x in program.outputs if not isinstance(x, InMemory) for n in x.ravel().tolist()]
+        nodes = [n for x in program.outputs if not isinstance(x, StridedArray) for n in x.ravel().tolist()]
         if not all(isinstance(n, Node) for n in nodes):
             raise Unsupported("keys of random numbers as results")
-        self.needed = list_needed([*nodes, *(x.buffer for x in program.outputs if isinstance(x, InMemory))])
+        self.needed = list_needed_items([*nodes, *(x.buffer for x in program.outputs if isinstance(x, StridedArray))])
         self.values: dict[Node, jax.Array] = {}
         self.memory: Memory = {}
 
@@ -58,7 +58,7 @@ class _JaxEvaluation:
 
     def _gather_result(self, value: Any) -> jax.Array:
         """Return an array of the result: its numbers stacked, or read from memory by places and strides."""
-        if not isinstance(value, InMemory):
+        if not isinstance(value, StridedArray):
             nodes = [self.value(n) for n in value.ravel().tolist()]
             return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
         owner, start = value.buffer.owner
@@ -77,7 +77,7 @@ class _JaxEvaluation:
             if statement not in self.needed:  # a check of a loop among them
                 continue
             if isinstance(statement, Store):
-                entry = self._entry_at(statement.buffer, statement.offset, statement.strides, statement.indices)
+                entry = self._locate_entry(statement.buffer, statement.offset, statement.strides, statement.indices)
                 owner = statement.buffer.owner[0]
                 self.memory[owner] = self.memory[owner].at[entry].set(self.value(statement.node))
             elif isinstance(statement, Loop):
@@ -91,7 +91,7 @@ class _JaxEvaluation:
         """Compute a node by the operation of JAX that has its name."""
         if node.op == "load":
             buffer, offset, strides = node.value
-            return self.memory[buffer.owner[0]][self._entry_at(buffer, offset, strides, node.args)]
+            return self.memory[buffer.owner[0]][self._locate_entry(buffer, offset, strides, node.args)]
         arguments = [self.value(a) for a in node.args]
         if node.op == "convert":
             return arguments[0].astype(DTYPES[node.type])
@@ -103,7 +103,7 @@ class _JaxEvaluation:
         computed: jax.Array = operation(*arguments)
         return computed
 
-    def _entry_at(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
+    def _locate_entry(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
         """Return the place offset + sum strides * indices in the memory that a buffer uses."""
         pairs = zip(strides, indices, strict=True)
         return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)

@@ -1,7 +1,7 @@
 """Lowering of a traced function of one run to a graph of scalar operations.
 
 An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations only move
-references; or, if it is long, `InMemory`. `RULES` has a rule for each operation of JAX, from the files of rules.
+references; or, if it is long, `StridedArray`. `RULES` has a rule for each operation of JAX, from the files of rules.
 """
 
 import os
@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 from straightline.graph import Graph
 from straightline.nodes import TYPES, Buffer, Node, RandomKey, Type, Unsupported
 from straightline.size_limits import LONGEST, TABLE, WRITTEN_OUT
-from straightline.strided_arrays import InMemory
+from straightline.strided_arrays import StridedArray
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory
 Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
@@ -62,9 +62,9 @@ class Lowering:
         values = self.inline_program(program, inputs)
         return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
 
-    def _make_empty_view(self, aval: Any) -> InMemory:
+    def _make_empty_view(self, aval: Any) -> StridedArray:
         """Return an array without entries, in memory of its type and shape."""
-        return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
+        return StridedArray.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Return the results of one operation.
@@ -87,7 +87,7 @@ class Lowering:
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
         """Apply the rule of an operation: in memory if an input is there, else on its entries."""
-        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
+        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, StridedArray) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:
             raise Unsupported(name)
@@ -95,7 +95,7 @@ class Lowering:
 
     def nodes(self, value: Value) -> np.ndarray:
         """Return a value as a NumPy array of nodes."""
-        return value.nodes(self.graph) if isinstance(value, InMemory) else value
+        return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
         """Return the node of a value without axes."""
@@ -114,7 +114,7 @@ class Lowering:
         array = np.asarray(number)
         type = type_of(array)
         if array.size > TABLE:
-            return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
+            return StridedArray.whole(Buffer("table", type, array.shape, self.graph.top, array))
         return arrange_nodes([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
     def _look_up(self, values: dict[Var, Value], v: Any) -> Value:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from straightline.graph import Graph
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store, Type
-from straightline.program import REFERRING, list_needed, list_used_nodes
+from straightline.program import REFERRING, list_needed_items, list_used_nodes
 from straightline.rules.elementwise import select
 from straightline.size_limits import DEAR
 
@@ -29,7 +29,7 @@ RING = 32  # rows: of a longer cycle every turn is computed
 INTEGERS: dict[Type, Type] = {"f64": "i64", "f32": "i32"}  # that have the bits of a real number
 
 
-class Recurring(NamedTuple):
+class RecurringNodes(NamedTuple):
     """What of a loop's body may come back.
 
     nodes: S, in order; carried: C, by number; tests: of a turn's rows, of which S needs the outcome; rows: what these
@@ -42,12 +42,12 @@ class Recurring(NamedTuple):
     rows: dict[Node, None]
 
 
-def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
+def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
     """Rewrite each counted loop of one run where much comes back; return what the outputs need then.
 
     Much: S has more than DEAR operations beside the numbers that others need of it.
     """
-    items = list_needed(outputs)
+    items = list_needed_items(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
         found = _find_recurring(loop, items)
         if found is None:
@@ -55,11 +55,11 @@ def keep_cycles(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
         kept = _list_needed_elsewhere(items, found)
         if len(found.nodes) > DEAR + len(kept):
             _rewrite_loop(graph, items, loop, found, kept)
-            items = list_needed(outputs)
+            items = list_needed_items(outputs)
     return items
 
 
-def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
+def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | None:
     """Return S and C of a loop's body, and the tests of rows that S needs; None where S is no more than DEAR nodes.
 
     S, C, tests and rows are those of this file's beginning. Sets of nodes are the keys of a dict, which keeps an order.
@@ -68,19 +68,19 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     """
     body = loop.body
     nodes = [x for x in body.items if isinstance(x, Node) and x in needed]
-    of_rows = _find_of_rows(loop, nodes)
+    of_rows = _find_nodes_of_rows(loop, nodes)
     # Tests: flags of rows that are computed of numbers, rather than of other flags.
     tests = {n for n in of_rows if n.type == "bool" and all(a.type != "bool" for a in n.args)}
     # The largest set C: begin with all carried numbers, and drop those whose next value does not follow from C.
     carried = [k for k, parameter in enumerate(loop.parameters) if parameter in needed]
-    operations = [(n, _list_inner(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
+    operations = [(n, _list_nodes_of_body(n.args, body)) for n in nodes if n.op not in REFERRING and n not in tests]
     while True:
         known, computed = tests | {loop.parameters[k] for k in carried}, dict[Node, None]()
         for n, arguments in operations:
             if known.issuperset(arguments):
                 known.add(n)
                 computed[n] = None
-        still_carried = [k for k in carried if known.issuperset(_list_inner([loop.following[k]], body))]
+        still_carried = [k for k in carried if known.issuperset(_list_nodes_of_body([loop.following[k]], body))]
         if still_carried == carried:
             break
         carried = still_carried
@@ -93,22 +93,22 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> Recurring | None:
     used_tests = [n for n in of_rows if n in tests and n in used]
     sources = _list_sources(of_rows, used_tests)
     recurring = {n: None for n in computed if n not in sources}
-    return Recurring(nodes=recurring, carried=carried, tests=used_tests, rows=sources)
+    return RecurringNodes(nodes=recurring, carried=carried, tests=used_tests, rows=sources)
 
 
-def _list_inner(nodes: Sequence[Node], body: Block) -> list[Node]:
+def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
     """Return those of the numbers that are computed in a loop's body: all others are there before it."""
     return [n for n in nodes if n.block is body]
 
 
-def _find_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
+def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
     """Return which numbers of a body follow from memory that is filled before the loop and from the turn's number."""
     results, known = dict[Node, None](), {loop.counter}
     for n in nodes:
         buffer = n.value[0].owner[0] if n.op == "load" else None
         filled = buffer is None or (buffer.kind != "carried" and n.value[0].block is not loop.body)
         plain = n.op == "load" or n.op not in REFERRING
-        if plain and filled and known.issuperset(_list_inner(n.args, loop.body)):
+        if plain and filled and known.issuperset(_list_nodes_of_body(n.args, loop.body)):
             known.add(n)
             results[n] = None
     return results
@@ -135,13 +135,13 @@ def _leave_fused_products(needed: Iterable[Any], found: dict[Node, None]) -> Non
             del found[n]
 
 
-def _list_needed_elsewhere(items: Iterable[Any], found: Recurring) -> list[Node]:
+def _list_needed_elsewhere(items: Iterable[Any], found: RecurringNodes) -> list[Node]:
     """Return the numbers of S that something else needs, in order."""
     used = {a for x in items if x not in found.nodes for a in list_used_nodes(x)}
     return [n for n in found.nodes if n in used]
 
 
-class Ring:
+class RingBuffer:
     """Memory for rows of some numbers of these types, one buffer for each type; filled in the turns of a loop."""
 
     def __init__(self, graph: Graph, types: Sequence[Type], loop: Loop, rows: int = RING):
@@ -159,7 +159,7 @@ class Ring:
         return [self._graph.load(buffer, place, buffer.shape[1:], (row,)) for buffer, place in self._places]
 
 
-class Turn(NamedTuple):
+class RingTurn(NamedTuple):
     """The turn's row of the ring; whether the turn computes S for it, seeking a cycle, and whether one begins there."""
 
     now: Node
@@ -167,7 +167,7 @@ class Turn(NamedTuple):
     begins: Node
 
 
-def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurring, kept: Sequence[Node]) -> None:
+def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: RecurringNodes, kept: Sequence[Node]) -> None:
     """Rewrite a loop so that S is computed only in turns that seek a cycle; all other turns read it from a ring.
 
     S are the numbers that may come back, C the carried ones that they follow from (this file's beginning). The ring is
@@ -188,10 +188,10 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
     # The body begins anew with the tests alone; `rest` is put at its end.
     rest = [x for x in body.items if x not in found.nodes and x not in found.rows]
     body.items, body.seen, graph.current = [*found.rows], {}, body
-    test_ring, value_ring = (Ring(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
+    test_ring, value_ring = (RingBuffer(graph, [n.type for n in nodes], loop) for nodes in (found.tests, kept))
     # Before the first turn it is as if the ring were full, so that row 0 is next.
     last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
-    turn = _choose_row(graph, found.tests, test_ring, last_row, period)
+    turn = _choose_ring_row(graph, found.tests, test_ring, last_row, period)
     # S, the stores of its row, and whether it closes a cycle.
     closes = _guard_nodes(graph, loop, found, kept, turn, (test_ring, value_ring))
     # A cycle that closes with row p - 1 has the period p.
@@ -208,7 +208,12 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
 
 
 def _guard_nodes(
-    graph: Graph, loop: Loop, found: Recurring, kept: Sequence[Node], turn: Turn, rings: tuple[Ring, Ring]
+    graph: Graph,
+    loop: Loop,
+    found: RecurringNodes,
+    kept: Sequence[Node],
+    turn: RingTurn,
+    rings: tuple[RingBuffer, RingBuffer],
 ) -> Node:
     """Move S to a guarded block, for turns that seek a cycle; return whether C has the bits with which it began.
 
@@ -228,7 +233,7 @@ def _guard_nodes(
     return guard.results[0]
 
 
-def _choose_row(graph: Graph, now: Sequence[Node], tests: Ring, row: Node, period: Node) -> Turn:
+def _choose_ring_row(graph: Graph, now: Sequence[Node], tests: RingBuffer, row: Node, period: Node) -> RingTurn:
     """Choose a turn's row: the next of a cycle if that has the tests of now, else one for which S is computed.
 
     now: the outcomes of the turn's tests; tests: the ring with those of each row; row: the last turn's row; period: of
@@ -244,14 +249,16 @@ def _choose_row(graph: Graph, now: Sequence[Node], tests: Ring, row: Node, perio
     full = node("eq", "bool", row, graph.constant(RING - 1, "i64"))
     begins = node("or", "bool", node("not", "bool", unknown), full)
     sought = select(graph, begins, zero, following)
-    return Turn(now=select(graph, seeks, sought, of_cycle), seeks=seeks, begins=begins)
+    return RingTurn(now=select(graph, seeks, sought, of_cycle), seeks=seeks, begins=begins)
 
 
 def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins: Node) -> Node:
     """Return whether the next values of carried numbers have the bits that these had when the cycle began."""
     block, zero = graph.current, graph.constant(0, "i64")
     # Their bits before row 0, stored in the turns in which a cycle begins.
-    reference = Ring(graph, [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried], loop, 1)
+    reference = RingBuffer(
+        graph, [INTEGERS.get(loop.parameters[k].type, loop.parameters[k].type) for k in carried], loop, 1
+    )
     guard = Guard(Block(block, pinned=True), begins)
     block.items.append(guard)
     graph.current = guard.body

@@ -11,7 +11,7 @@ from straightline.nodes import Block, Buffer, Node, Type, Unsupported
 from straightline.size_limits import LOADED
 
 
-class InMemory:
+class StridedArray:
     """Array with entry (i, j, ...) at offset + sum strides * (i, j, ...) + sum of moves, pairs (stride, node)."""
 
     __slots__ = ("buffer", "loaded", "moves", "offset", "shape", "strides")
@@ -30,7 +30,7 @@ class InMemory:
         )
 
     @classmethod
-    def whole(cls, buffer: Buffer) -> "InMemory":
+    def whole(cls, buffer: Buffer) -> "StridedArray":
         """Return the view of a whole buffer."""
         return cls(buffer, buffer.shape, contiguous_strides(buffer.shape))
 
@@ -51,11 +51,11 @@ class InMemory:
 
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
-    ) -> "InMemory":
+    ) -> "StridedArray":
         """Return another view of the same memory, at a further offset."""
-        return InMemory(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
+        return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
-    def row(self, index: Node | int) -> "InMemory":
+    def row(self, index: Node | int) -> "StridedArray":
         """Return entry `index` along the first axis."""
         if isinstance(index, int) or index.op == "constant":
             known = index if isinstance(index, int) else int(index.value)
@@ -85,7 +85,7 @@ class InMemory:
             nodes[index] = graph.load(self.buffer, offset, strides, indices)
         return nodes
 
-    def view_in_shape(self, shape: tuple[int, ...]) -> "InMemory | None":
+    def view_in_shape(self, shape: tuple[int, ...]) -> "StridedArray | None":
         """Return a view of the same numbers in another shape, None if no strides describe it."""
         if not self.size:
             return self.view(shape, (0,) * len(shape))

@@ -14,12 +14,12 @@ from straightline.constant_folding import DTYPES
 from straightline.llvm.module_text import write_module
 from straightline.lowering import make_placeholder
 from straightline.machine_code import TieredCode, choose_hasty_width, find_processor_features
-from straightline.program import Program, SummedOutputs, fold_rows, lower_function, row_length
+from straightline.program import Program, SummedOutputs, fold_rows_into_batches, lower_function, row_length_of_sums
 
 PARTS = 64  # sums of their own, which computers of any number of cores share out
 
 
-class AccumulatedProgram:
+class SummingProgram:
     """Code of a program with one argument that differs between runs, the number of the run.
 
     `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
@@ -42,7 +42,7 @@ class AccumulatedProgram:
 
         Of those variables all runs share some; each of the blocks that are computed at once (`in_flight`) has others.
         """
-        length = row_length(self.width, self.summed.batches)
+        length = row_length_of_sums(self.width, self.summed.batches)
         collected = sums = 0.0
         for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
             if common:
@@ -53,12 +53,12 @@ class AccumulatedProgram:
                 collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
         return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
 
-    def begin(self, arguments: Sequence[Any], runs: int) -> "BegunProgram":
+    def begin(self, arguments: Sequence[Any], runs: int) -> "SummingProgramWithArguments":
         """Return the program with its arguments (all but the run's number), and what all runs share, computed.
 
         The code is made for as many runs as will follow.
         """
-        return BegunProgram(self, arguments, runs)
+        return SummingProgramWithArguments(self, arguments, runs)
 
     def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
         """Compute runs on all cores; return a tree of sums, (..., batch), and of what is collected, (run, ...).
@@ -86,7 +86,7 @@ class AccumulatedProgram:
 
     def _join_parts(
         self,
-        begun: "BegunProgram",
+        begun: "SummingProgramWithArguments",
         sums: Sequence[Sequence[np.ndarray]],
         collected: Sequence[Sequence[np.ndarray | None]],
         first: int,
@@ -97,7 +97,10 @@ class AccumulatedProgram:
         A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
         runs share is repeated for each run, or counts once for each run of a batch.
         """
-        totals, runs_by_batch = iter(begun.add_parts(sums)), _count_by_batch(first, runs, self.summed.batches)
+        totals, runs_by_batch = (
+            iter(begun.add_partial_sums(sums)),
+            _count_runs_by_batch(first, runs, self.summed.batches),
+        )
         leaves: list[Any] = []
         for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
             if shared is None:
@@ -109,10 +112,10 @@ class AccumulatedProgram:
         return leaves
 
 
-class BegunProgram:
+class SummingProgramWithArguments:
     """A program with its arguments; `shared` has the results that all runs share, None for all others."""
 
-    def __init__(self, program: AccumulatedProgram, arguments: Sequence[Any], runs: int):
+    def __init__(self, program: SummingProgram, arguments: Sequence[Any], runs: int):
         """Convert the arguments, compute what all runs share, and make code for about so many runs."""
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
@@ -132,11 +135,11 @@ class BegunProgram:
         self._machine = None if all(program.common) else program.blocks.choose_machine(-(-runs // program.width))
 
     def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
-        """Return sums over no runs, of each summed result that runs do not share, as `add` and `add_parts` take them.
+        """Return sums over no runs of each summed result that runs do not share, for `add` and `add_partial_sums`.
 
         `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
         """
-        length = row_length(self.program.width, self.program.summed.batches)
+        length = row_length_of_sums(self.program.width, self.program.summed.batches)
         shapes = [(*b.shape, length) for b, s in self._list_outputs() if s]
         try:  # threads may take from it at once
             taken = [] if memory is None else memory.pop()
@@ -180,12 +183,15 @@ class BegunProgram:
             collected.append(None if summed or common else outputs[-1])
         return outputs, collected
 
-    def add_parts(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    def add_partial_sums(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
 
         The first of them is overwritten.
         """
-        return [fold_rows(_add_in_order(sums), self.program.summed.batches) for sums in zip(*parts, strict=True)]
+        return [
+            fold_rows_into_batches(_add_in_order(sums), self.program.summed.batches)
+            for sums in zip(*parts, strict=True)
+        ]
 
     def _list_outputs(self) -> list[tuple[Any, bool]]:
         """Return each output, and whether it is a sum over runs in memory: what all runs share is none."""
@@ -206,7 +212,7 @@ def accumulate(
     batches: int = 1,
     known: Mapping[int, np.ndarray] = MappingProxyType({}),
     single: bool = False,
-) -> AccumulatedProgram:
+) -> SummingProgram:
     """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
     Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
@@ -233,7 +239,7 @@ def accumulate(
     program = lower_function(function, *examples, make_placeholder((), np.uint32), known=known_numbers, single=single)
     summed_leaves = _count_summed_leaves(program.tree)
     summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
-    return AccumulatedProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))
+    return SummingProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))
 
 
 def _count_summed_leaves(tree: Any) -> int:
@@ -258,7 +264,7 @@ def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
     return total
 
 
-def _count_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
+def _count_runs_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
     """Return how many of the runs from `first` on each batch has; run r is in batch r mod `batches`.
 
     All have the same number, but for the rest, of which the batches from that of the first run on have one each.

@@ -18,7 +18,7 @@ from heliograph.factors import (
     triangularise,
     unit_lower,
 )
-from heliograph.factors.covariance_factors import root_of
+from heliograph.factors.covariance_factors import find_covariance_root
 
 # One program for each size, not one for each of its hundred operations.
 triangularise, eliminate = jax.jit(triangularise), jax.jit(eliminate)
@@ -87,7 +87,7 @@ def test_decorrelated_rows_have_independent_noises():
 def test_a_known_covariance_has_as_many_columns_as_its_rank(rank):
     """Whatever the units: its components' deviations differ by 1e12."""
     root = np.random.default_rng(rank).normal(size=(3, rank)) * np.array([[1e-6], [1.0], [1e6]])
-    made = root_of(root @ root.T)
+    made = find_covariance_root(root @ root.T)
     unit = np.sqrt(np.maximum(np.diagonal(root @ root.T), 1e-300))
     assert made.shape == (3, rank)
     assert np.max(np.abs(made @ made.T - root @ root.T) / np.outer(unit, unit), initial=0.0) < 1e-12

@@ -190,13 +190,13 @@ def test_calls_go_on_with_first_arguments_that_are_held():
 
     code = compile(function, np.eye(2), 0.0, np.zeros(2), shared=[0, 1])
     matrix, x = np.array([[2.0, 1.0], [0.0, 4.0]]), np.arange(6.0).reshape(3, 2)
-    held, all_held = code.with_first(matrix), code.with_first(matrix, 0.5)
+    held, all_held = code.with_first_arguments(matrix), code.with_first_arguments(matrix, 0.5)
     for offset in (0.5, -1.0):
         assert np.array_equal(held(offset, x), code(matrix, offset, x))
         assert np.array_equal(all_held(x + offset), code(matrix, 0.5, x + offset))
-    assert np.array_equal(code.with_first(np.eye(2), 0.5)(x), code(np.eye(2), 0.5, x))
+    assert np.array_equal(code.with_first_arguments(np.eye(2), 0.5)(x), code(np.eye(2), 0.5, x))
     with pytest.raises(ValueError, match="array 0 of the arguments: expected shape"):
-        code.with_first(np.eye(3))
+        code.with_first_arguments(np.eye(3))
 
 
 def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
@@ -208,8 +208,8 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
 
     rng = np.random.default_rng(0)
     shared, x = rng.uniform(size=(3, 3)), rng.normal(size=(9, 3))
-    code = compile(step, shared, x[0], shared=[0]).with_first(shared)
-    one, other = code.for_runs(1), code.for_runs(1)
+    code = compile(step, shared, x[0], shared=[0]).with_first_arguments(shared)
+    one, other = code.make_in_place_code(1), code.make_in_place_code(1)
     moved, root = code(x)
     for run in range(9):
         one.inputs[0][0] = x[run]
@@ -220,16 +220,16 @@ def test_one_run_has_the_bits_of_many_in_memory_of_its_own():
     assert not other.inputs[0].any()
     # Many runs at a time, whose memory is given, and what they share anew in every call.
     loose = compile(step, shared, x[0], shared=[0])
-    many = loose.for_runs(9, {1: x})
+    many = loose.make_in_place_code(9, {1: x})
     for scale in (1.0, 2.0):
         many.inputs[0][...] = scale * shared
         many()
         for held, right in zip(many.outputs, loose(scale * shared, x), strict=True):
             assert held.tobytes() == right.tobytes()
     with pytest.raises(ValueError, match="array 1 read in place: expected contiguous numbers of type float64"):
-        loose.for_runs(9, {1: x.astype(np.float32)})
+        loose.make_in_place_code(9, {1: x.astype(np.float32)})
     with pytest.raises(ValueError, match="array 1 of the arguments: expected shape"):
-        loose.for_runs(8, {1: x})
+        loose.make_in_place_code(8, {1: x})
 
 
 @pytest.mark.parametrize("place", [1, 8, 40, 49])

@@ -8,8 +8,8 @@ import pytest
 from straightline import present
 from straightline.lowering import list_nodes
 from straightline.machine_code import Machine
-from straightline.program import SummedOutputs, fold_rows, lower_function, row_length
-from straightline.sums_over_runs import AccumulatedProgram
+from straightline.program import SummedOutputs, fold_rows_into_batches, lower_function, row_length_of_sums
+from straightline.sums_over_runs import SummingProgram
 
 BATCHES, STEPS = 50, 4
 
@@ -29,7 +29,7 @@ def walk(start, number):
 def begun():
     with jax.enable_x64(True):
         program = lower_function(walk, np.float64(0), np.uint32(0))
-    return AccumulatedProgram(program, SummedOutputs((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
+    return SummingProgram(program, SummedOutputs((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
 
 
 def expected(runs):
@@ -45,7 +45,7 @@ def test_runs_are_added_to_their_batches(begun, count):
         runs, sums = np.arange(first, first + count), begun.make_zero_sums()
         collected = begun.add(runs, sums)
         squares, positions = expected(runs)
-        np.testing.assert_allclose(fold_rows(sums[0], BATCHES), squares, rtol=1e-14)
+        np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), squares, rtol=1e-14)
         np.testing.assert_array_equal(collected[1], positions)
         assert collected[0] is None and collected[2] is None
     np.testing.assert_array_equal(begun.shared[2], [0.0, 2.0, 4.0])
@@ -56,7 +56,7 @@ def test_sums_go_on(begun):
     sums = begun.make_zero_sums()
     for start in range(0, 320, 32):
         begun.add(np.arange(start, start + 32), sums)
-    np.testing.assert_allclose(fold_rows(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
+    np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
 
 
 def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
@@ -67,7 +67,7 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
 
     with jax.enable_x64(True):
         program = lower_function(uneven, np.float64(0), np.uint32(0))
-    code = AccumulatedProgram(program, SummedOutputs((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
+    code = SummingProgram(program, SummedOutputs((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
     results = []
     for width in (1, 2, 4, 8):
         code._machine, sums = Machine(code.program.code.blocks, 0, width), code.make_zero_sums()
@@ -80,8 +80,10 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
 
 
 def test_rows_are_folded_once():
-    row = np.arange(row_length(16, BATCHES), dtype=float)
-    np.testing.assert_array_equal(fold_rows(row, BATCHES), np.where(np.arange(50) < 15, 2 * row[:50] + 50, row[:50]))
+    row = np.arange(row_length_of_sums(16, BATCHES), dtype=float)
+    np.testing.assert_array_equal(
+        fold_rows_into_batches(row, BATCHES), np.where(np.arange(50) < 15, 2 * row[:50] + 50, row[:50])
+    )
 
 
 def test_a_sum_of_what_is_used_again():
@@ -94,14 +96,14 @@ def test_a_sum_of_what_is_used_again():
     with jax.enable_x64(True):
         program = lower_function(twice, np.float64(0), np.uint32(0))
     code, runs = (
-        AccumulatedProgram(program, SummedOutputs((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40),
+        SummingProgram(program, SummedOutputs((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40),
         np.arange(40),
     )
     sums = code.make_zero_sums()
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2
     np.testing.assert_allclose(code.add(runs, sums)[1], before, rtol=1e-14)
-    np.testing.assert_allclose(fold_rows(sums[0], BATCHES), squares, rtol=1e-14)
+    np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), squares, rtol=1e-14)
 
 
 def test_what_has_arrived_is_never_requested():

@@ -159,7 +159,7 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
     return assemble_factors(lower, variances, rows.dtype)
 
 
-def absorb_columns(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
+def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
     """Return the factors (unit lower triangular M, e) with M diag(e) M' = L diag(d) L' + W diag(w) W'.
 
     `factors` are L (n, n), unit lower triangular, and d (n,); `columns` W (n, count) and w (count,), absorbed one after
@@ -224,7 +224,7 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
     return jnp.stack(solved) if solved else rows
 
 
-def root_of(covariance: np.ndarray) -> np.ndarray:
+def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
     """Return W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of the deviations.
 
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
@@ -243,9 +243,9 @@ def root_of(covariance: np.ndarray) -> np.ndarray:
     return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
 
 
-def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Factor a known covariance: entries of L below its diagonal, and d, by the orthogonal rows of its root."""
-    rows = root_of(covariance)
+    rows = find_covariance_root(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
     for j in range(n):
         variances[j] = rows[j] @ rows[j]
@@ -257,7 +257,7 @@ def factor_constant(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def columns_of(covariance: Array) -> WeightedColumns:
     """Return the columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
     if isinstance(covariance, np.ndarray):
-        root = root_of(covariance)
+        root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))
     return eliminate(jnp.asarray(covariance))
 
@@ -274,20 +274,23 @@ def factor_covariances(covariances: Array) -> WeightedColumns:
     each = list(covariances.reshape(-1, n, n))
     # Most steps of a long horizon have the same covariance, which is factored once.
     different = {covariance.tobytes(): covariance for covariance in each}
-    roots = {numbers: root_of(covariance) for numbers, covariance in different.items()}
+    roots = {numbers: find_covariance_root(covariance) for numbers, covariance in different.items()}
     padded = {numbers: np.pad(root, ((0, 0), (0, n - root.shape[1]))) for numbers, root in roots.items()}
     matrices = [padded[covariance.tobytes()] for covariance in each]
     return WeightedColumns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
 
 
-def rounding_of(seconds: Array) -> WeightedColumns:
-    """Return the rounding of numbers of second moments E[s_i^2] (n,), as noise of (ROUNDING_UNITS eps)^2 E[s_i^2].
+def rounding_of(second_moments: Array) -> WeightedColumns:
+    """Return the covariance (n, n) of the rounding of numbers s_i: diagonal, (ROUNDING_UNITS eps)^2 E[s_i^2].
 
     It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
     variance it would be lost.
+
+    Args:
+        second_moments: E[s_i^2] (n,); of very large ones the variance is LARGEST, so that it stays finite.
     """
-    variances = (ROUNDING_UNITS * unit_of(seconds)) ** 2 * seconds
-    return WeightedColumns(np.eye(len(seconds)), library(seconds).minimum(variances, LARGEST))
+    variances = (ROUNDING_UNITS * unit_of(second_moments)) ** 2 * second_moments
+    return WeightedColumns(np.eye(len(second_moments)), library(second_moments).minimum(variances, LARGEST))
 
 
 def rounding_of_pivots(covariance: Array) -> float:

@@ -67,16 +67,16 @@ def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array
     return (slopes * x.variances) @ slopes.T, unknown
 
 
-class LevelWeights(NamedTuple):
+class FiniteAndInfiniteWeights(NamedTuple):
     """Weights of columns (c,): finite ones, and infinite ones."""
 
     finite: jax.Array
     infinite: jax.Array
 
 
-def triangularise_levels(
-    rows: jax.Array, weights: LevelWeights, count: int, whole: jax.Array | None = None
-) -> tuple[jax.Array, LevelWeights, jax.Array]:
+def triangularise_both_levels(
+    rows: jax.Array, weights: FiniteAndInfiniteWeights, count: int, whole: jax.Array | None = None
+) -> tuple[jax.Array, FiniteAndInfiniteWeights, jax.Array]:
     """Make the first `count` rows (c columns) orthogonal in the weights w, from the first down.
 
     Row j, a, has s = sum of w a^2 over infinite columns. Where more than rounding is left of s, L_ij follows from these
@@ -107,39 +107,43 @@ def triangularise_levels(
         finite.append(jnp.where(is_infinite, 0.0, finite_s))
         infinite.append(jnp.where(is_infinite, infinite_s, 0.0))
         rows = jnp.where((numbers > j)[:, None], rows - column[:, None] * row, rows)
-    return jnp.stack(columns, axis=1), LevelWeights(jnp.stack(finite), jnp.stack(infinite)), rows
+    return jnp.stack(columns, axis=1), FiniteAndInfiniteWeights(jnp.stack(finite), jnp.stack(infinite)), rows
 
 
 def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
     """Return the law of a state of which some components (n,) are unknown, the others known by columns."""
     n = len(mean)
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
-    weights = LevelWeights(
+    weights = FiniteAndInfiniteWeights(
         jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
         jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])]),
     )
-    lower, levels, _ = triangularise_levels(rows, weights, n)
+    lower, levels, _ = triangularise_both_levels(rows, weights, n)
     return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
 
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w."""
-    rows, weights = _append_noise(matrix @ x.root, x, noise)
-    lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
+    rows, weights = _append_noise_columns(matrix @ x.root, x, noise)
+    lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
 
 
-def _append_noise(slopes: jax.Array, x: Diffuse, noise: WeightedColumns) -> tuple[jax.Array, LevelWeights]:
+def _append_noise_columns(
+    slopes: jax.Array, x: Diffuse, noise: WeightedColumns
+) -> tuple[jax.Array, FiniteAndInfiniteWeights]:
     """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
 
     x gives the weights of xi, finite and infinite ones; those of omega are finite.
     """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
     own = jnp.asarray(noise.weights)
-    return rows, LevelWeights(jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))]))
+    return rows, FiniteAndInfiniteWeights(
+        jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))])
+    )
 
 
-class DiffuseEvidence(NamedTuple):
+class DiffuseLikelihood(NamedTuple):
     """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
 
     log_likelihood: jax.Array
@@ -148,7 +152,7 @@ class DiffuseEvidence(NamedTuple):
 
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
-) -> tuple[Diffuse, DiffuseEvidence]:
+) -> tuple[Diffuse, DiffuseLikelihood]:
     """Condition x on z = H x + v; return it and what z says of the model.
 
     A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
@@ -176,7 +180,7 @@ def observe_diffuse(
         log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         density = density + jnp.where(present[i], log, 0.0)
         shows_unknown.append(shows & present[i])
-    return state._replace(mean=x.mean + shift), DiffuseEvidence(density, jnp.stack(shows_unknown))
+    return state._replace(mean=x.mean + shift), DiffuseLikelihood(density, jnp.stack(shows_unknown))
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
@@ -237,10 +241,10 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     n = len(x.mean)
-    moved, weights = _append_noise(matrix @ x.root, x, noise)
+    moved, weights = _append_noise_columns(matrix @ x.root, x, noise)
     own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
-    lower, _, rest = triangularise_levels(jnp.concatenate([moved, own]), weights, n)
-    left, levels, _ = triangularise_levels(rest[n:], weights, n, own**2 @ weights.infinite)
+    lower, _, rest = triangularise_both_levels(jnp.concatenate([moved, own]), weights, n)
+    left, levels, _ = triangularise_both_levels(rest[n:], weights, n, own**2 @ weights.infinite)
     law = Gaussian(x.mean, below_diagonal(left), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
     return BackwardGain(law, lower[n:], ahead, below_diagonal(lower[:n]))
 

@@ -1,8 +1,8 @@
 """A Gaussian by its mean and the factors L diag(d) L' of its covariance, and the operations that filters are made of.
 
 With x = m + L xi, xi uncorrelated with variances d, everything is said by slopes in xi: of F x they are F L, of a
-measurement H x they are H L. Sums of independent terms are columns side by side (`covariance_factors.py`). No operation takes the
-difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
+measurement H x they are H L. Sums of independent terms are columns side by side (`covariance_factors.py`). No operation
+takes the difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
 """
 
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ from jax import lax
 
 from heliograph.factors.covariance_factors import (
     WeightedColumns,
-    absorb_columns,
+    add_columns_to_factors,
     below_diagonal,
     decorrelate,
     eliminate,
-    factor_constant,
+    factor_known_covariance,
     join_columns,
     reciprocal_or_one,
     reciprocal_or_zero,
@@ -33,11 +33,11 @@ from heliograph.factors.repeated_measurements import (
     triangularise_noise,
 )
 from heliograph.factors.scalar_update import (
-    measure_parts,
-    measure_row,
-    measure_rows,
-    measure_scalar_given_products,
-    update_columns,
+    update_by_parts,
+    update_by_row,
+    update_by_rows,
+    update_by_scalar_given_products,
+    update_root_columns,
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
@@ -100,7 +100,7 @@ def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Ga
 def from_covariance(mean: Array, covariance: Array) -> Gaussian:
     """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
     if isinstance(covariance, np.ndarray):
-        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_constant(covariance))
+        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_known_covariance(covariance))
         return Gaussian(*factors)
     columns = eliminate(jnp.asarray(covariance), rounding_of_pivots(covariance))
     return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
@@ -171,7 +171,7 @@ def add_noise_to_image(image: Image, noise: WeightedColumns) -> Gaussian:
     Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
     """
     if writes_short_programs():
-        factors = absorb_columns(noise, image.columns)
+        factors = add_columns_to_factors(noise, image.columns)
         return Gaussian(image.mean, below_diagonal(factors.matrix), factors.weights)
     return from_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
 
@@ -225,7 +225,7 @@ def condition_on_observation(
     least = rounding_of_slopes(n, fresh.matrix, whole)
     # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
     root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
-    root, d, news, values, totals = measure_rows(root, x.variances, news, variance, least)
+    root, d, news, values, totals = update_by_rows(root, x.variances, news, variance, least)
     return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
 
 
@@ -243,9 +243,9 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Measure component i: return the rows and variances after it, and its gain."""
-        return measure_row(root, d, root[n + i], weights[i], rounding)[:3]
+        return update_by_row(root, d, root[n + i], weights[i], rounding)[:3]
 
-    *_, gains = measure_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
+    *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
     entering = unit_lower(below_diagonal(gains[n:]))
     return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
 
@@ -279,7 +279,7 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
     power = row * product
     before = jnp.append(0.0, lax.cumsum(power))
     s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
-    root, variances, w = update_columns(x.root, x.variances, product, (1 - ratio) * row, s)
+    root, variances, w = update_root_columns(x.root, x.variances, product, (1 - ratio) * row, s)
     return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
 
 
@@ -360,12 +360,12 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
         products = jnp.append(jnp.where(depends_on_xi, product, 0.0), r)
         powers = jnp.append(jnp.where(depends_on_xi, power, 0.0), r)
         rows = jnp.concatenate([root, column[:, None]], axis=1)
-        rows, d, gain, _ = measure_scalar_given_products(
+        rows, d, gain, _ = update_by_scalar_given_products(
             rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)
         )
         return rows[:, :n], d[:n], gain
 
-    root, d, gains = measure_parts(measure_part, root, x.variances, rounding_of_next)
+    root, d, gains = update_by_parts(measure_part, root, x.variances, rounding_of_next)
     left = Gaussian(x.mean, below_diagonal(root[:n]), d)
     return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
 

@@ -61,21 +61,28 @@ def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
     return 1024 / (ROUNDING_UNITS * n * unit_of(least)) ** 2 * least
 
 
-def _zero_rounding(numbers: jax.Array, least: jax.Array) -> jax.Array:
+def _set_rounding_to_zero(numbers: jax.Array, least: jax.Array) -> jax.Array:
     """Return numbers, and zero where they are no larger than `least`; NaN stays."""
     return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
 
 
 def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
-    """Write Gram-Schmidt out row by row: L and d with L diag(d) L' = A W A', A's `rows` and W's `weights`."""
-    m, share, size = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK), jnp.abs(rows)
+    """Factor L diag(d) L' = A diag(w) A' by Gram-Schmidt, written out row by row, for `triangularise_noise`.
+
+    Args:
+        rows: A (m, columns).
+        weights: w (columns,).
+    """
+    m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
+    size = jnp.abs(rows)  # of each entry, with the sizes of all that was taken off it
     lower, variances = list[jax.Array](), list[jax.Array]()
     for j in range(m):
         row = lax.index_in_dim(rows, j, keepdims=False)
-        if 0 < j < m - 1:
-            row = _zero_rounding(row, share * lax.index_in_dim(size, j, keepdims=False))
+        if 0 < j < m - 1:  # nothing was taken off the first one, and nothing follows the last
+            row = _set_rounding_to_zero(row, share * lax.index_in_dim(size, j, keepdims=False))
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
+        # Column j of L: how much of the row is in each row below it, which is taken off there.
         over = lax.reshape(reciprocal_or_one(variances[j]), (1,))
         below = column_below_diagonal(j, outer(lax.dot(rows, weighted), over))
         rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
@@ -85,13 +92,16 @@ def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedCo
 
 @operation(_triangularise_row_by_row)
 def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
-    """Compute `_triangularise_row_by_row` in a loop, for so many rows that a long program would be slow."""
+    """Factor L diag(d) L' = A diag(w) A' by the steps of `_triangularise_row_by_row` in a loop, of many rows."""
     m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
 
     def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j, its rounding cleared, off the rows below it, and put it into L and d."""
+        """Take row j, its rounding set to 0, off the rows below it; put column j into L and its variance into d.
+
+        Carried are what is left of the rows of A, the `size` of each entry with all that was taken off it, L and d.
+        """
         rows, size, lower, variances = carry
-        row = _zero_rounding(rows[j], share * size[j])
+        row = _set_rounding_to_zero(rows[j], share * size[j])
         weighted = weights * row
         d = row @ weighted
         below = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)

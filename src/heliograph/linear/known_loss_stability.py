@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.factors.square_root_update import observe_root, roots_of
-from heliograph.linear.jump_system import JumpSystem, mix_modes, propagate_by_mode, unpack_entries
+from heliograph.linear.jump_system import JumpSystem, mix_moments_of_modes, propagate_by_mode, unpack_triangle_entries
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float, Int
@@ -59,7 +59,7 @@ class KnownLossSystem(NamedTuple):
 
     def bound(self, gains: KindGains) -> Parts:
         """Return the steady U under gains of a radius below 1."""
-        bound: Parts = mix_modes(self.chain, self.close_loop(gains).steady()[0])
+        bound: Parts = mix_moments_of_modes(self.chain, self.close_loop(gains).steady()[0])
         return bound
 
 
@@ -77,7 +77,7 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
         return radius
     unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
     (witness,) = jumps._replace(added=unit).steady()
-    left: Parts = witness - propagate_by_mode(jumps.maps[0], mix_modes(system.chain, witness), 0.0)
+    left: Parts = witness - propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, witness), 0.0)
     return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
 
 
@@ -148,14 +148,14 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
 
 def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
     """Return the covariances that grow by the spectral radius: a positive map has such an eigenvector."""
-    parts = unpack_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
+    parts = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
     """Return the best gain of each kind for these covariances V by mode, with R and law scaled by `noise`."""
     results: list[np.ndarray] = []
-    before: Parts = mix_modes(system.chain, parts)
+    before: Parts = mix_moments_of_modes(system.chain, parts)
     for s, c in enumerate(system.outputs):
         modes = np.flatnonzero(system.known == s)
         v = before[modes].sum(axis=0)
@@ -220,16 +220,16 @@ def _find_unobserving_modes(
     space: np.ndarray, outputs: Sequence[np.ndarray]
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
     """List sets of modes that all miss a common eigenvector, largest for each subspace, with a basis of these."""
-    subspaces = {frozenset(_modes_not_observing(space, outputs)): space}
+    subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for known in list(subspaces.values()):
             smaller = _find_unobservable_part(output, known)
             if smaller.shape[1] and len(subspaces) < SETS_LIMIT:
-                subspaces.setdefault(frozenset(_modes_not_observing(smaller, outputs)), smaller)
+                subspaces.setdefault(frozenset(_list_modes_not_observing(smaller, outputs)), smaller)
     return [(tuple(sorted(modes)), basis) for modes, basis in subspaces.items() if modes]
 
 
-def _modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
+def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
     """Return the modes whose output matrix C_i maps the whole subspace to zero."""
     return (i for i, c in enumerate(outputs) if _find_unobservable_part(c, space).shape[1] == space.shape[1])
 

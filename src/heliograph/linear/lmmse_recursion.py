@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.factors.covariance_factors import rounding_of
 from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
 from heliograph.linear.jump_system import propagate_by_mode
-from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last_step
 from heliograph.model.estimate import Claim, weakest
 from heliograph.model.premises.premise import on_premise
 from heliograph.numerics.check import fail, instance
@@ -79,7 +79,7 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
-def step_covariance(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
+def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
     """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
 
     O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
@@ -120,12 +120,12 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = take_noise_roots(matrices, second_moments)
-        covariances = step_covariance(root, matrices, noises)
+        covariances = step_covariance_roots(root, matrices, noises)
         gains, root = _make_gains(system, matrices, covariances), covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
-    over_time = Gains(*(repeat_last(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
-    claim = _support_claim(claim, rounding.worst, rounding.when)
+    over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
+    claim = _lower_unsupported_claim(claim, rounding.worst, rounding.when)
     return on_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
 
 
@@ -168,7 +168,7 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
     )
 
 
-def _support_claim(claim: Claim, lost: float, step: int) -> Claim:
+def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
     """Lower the claim where rounding is more than a small part (`lost`) of a claimed variance."""
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
     if lost > DIGITS_TOLERANCE:

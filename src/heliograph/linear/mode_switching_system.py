@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.linear.jump_system import mix_modes, propagate_by_mode
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.linear.plant_and_measurement_maps import list_checked_steps
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
@@ -119,7 +119,7 @@ def _propagate_modes(
     # E H_j of y~ = (y, 1): the mean maps with a last row that keeps the 1.
     whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
     # sum_i Pi_ij E_i, and what the randomness of the maps makes of it.
-    before = mix_modes(rows, moments)
+    before = mix_moments_of_modes(rows, moments)
     of_random_maps = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
     # Cov(w)[j, l]: Pi_ij (delta_jl - Pi_il) is the covariance of the indicators of the next modes j and l, given i.
     indicators = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])

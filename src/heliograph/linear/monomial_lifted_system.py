@@ -5,8 +5,12 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.plant_and_measurement_maps import StepMaps, check_model, make_step_maps
-from heliograph.linear.system import LinearSystem, Steps, repeat_last
+from heliograph.linear.plant_and_measurement_maps import (
+    PlantAndMeasurementMaps,
+    check_model,
+    make_plant_and_measurement_maps,
+)
+from heliograph.linear.system import LinearSystem, Steps, repeat_last_step
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -40,7 +44,7 @@ def check_finite_moments(moments: Moments, k: int, order: int) -> None:
         raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
 
 
-class SteadyMoments:
+class SteadyMomentTest:
     """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
 
     What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)
@@ -98,7 +102,7 @@ def lift_modes(
     matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
     # That is not so of step 0, in which the chain does not move: the last one is at least step 1.
-    steady = SteadyMoments(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
+    steady = SteadyMomentTest(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
     steps, roundings, last_law = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
     for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
         if steady.is_steady(moments) and np.array_equal(law, last_law) and k > 1:
@@ -109,20 +113,22 @@ def lift_modes(
         check_finite_moments(moments, k, 2 * degree)
         next_second = products_of_monomials(moments, n + 1, degree)
         matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]
-        process, law = _spread_modes(law, chain, matrix @ second @ matrix.T, next_second)
+        process, law = _compute_noise_and_next_law(law, chain, matrix @ second @ matrix.T, next_second)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
         steps.append(Steps(np.kron(chain.T, matrix), no_drift, process, output, no_offset, noise))
         roundings.append((EPS * np.kron(law, np.diag(next_second)), rounding_of_noise))
         second, chain = next_second, np.asarray(measurement.transition)
-    over_time = Steps(*(repeat_last(values, len(plants)) for values in zip(*steps, strict=True)))
-    process_rounding, received_rounding = (repeat_last(values, len(plants)) for values in zip(*roundings, strict=True))
+    over_time = Steps(*(repeat_last_step(values, len(plants)) for values in zip(*steps, strict=True)))
+    process_rounding, received_rounding = (
+        repeat_last_step(values, len(plants)) for values in zip(*roundings, strict=True)
+    )
     whole = np.tile(projection, (1, modes))  # x is the sum over the modes of x 1{mode}
     return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
 
 
-def _spread_modes(
+def _compute_noise_and_next_law(
     law: Float[np.ndarray, " modes"],
     chain: Float[np.ndarray, "modes modes"],
     moved: Float[np.ndarray, "L L"],
@@ -192,7 +198,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     plant_0 = first(plant)
     n, m = len(plant_0.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
-    routes = make_step_maps(plant, sensor, channel, 2 * degree, horizon)
+    routes = make_plant_and_measurement_maps(plant, sensor, channel, 2 * degree, horizon)
     moments = initial_monomial_moments(plant_0, 2 * degree)
     premise = Premise(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
@@ -215,7 +221,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 
 
 def _lift_chain(
-    routes: Sequence[StepMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
 ) -> LinearSystem:
     """Lift the steps of a channel with memory: to monomials times the indicator of each joint mode (`lift_modes`).
 
@@ -233,7 +239,7 @@ def _lift_chain(
 
 
 def _lift_steps(
-    routes: Sequence[StepMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
 ) -> tuple[Steps, np.ndarray, np.ndarray]:
     """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
 
@@ -249,8 +255,8 @@ def _lift_steps(
     """
     plant_varies, measurement_varies = varies
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
-    steady = SteadyMoments(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
-    last: StepMaps | None = None
+    steady = SteadyMomentTest(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
+    last: PlantAndMeasurementMaps | None = None
     for k, route in enumerate(routes):
         if steady.is_steady(moments):
             break
@@ -269,8 +275,10 @@ def _lift_steps(
         output, offset = split_homogeneous(measurement_lift.matrix)
         steps.append(Steps(transition, drift, process, output, offset, noise))
         roundings.append((rounding_of_process, rounding_of_noise))
-    over_time = Steps(*(repeat_last(values, len(routes)) for values in zip(*steps, strict=True)))
-    process_rounding, received_rounding = (repeat_last(values, len(routes)) for values in zip(*roundings, strict=True))
+    over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
+    process_rounding, received_rounding = (
+        repeat_last_step(values, len(routes)) for values in zip(*roundings, strict=True)
+    )
     return over_time, process_rounding, received_rounding
 
 

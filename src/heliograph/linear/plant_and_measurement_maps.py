@@ -22,7 +22,7 @@ from heliograph.random_affine.sum_of_maps import move_sensor_into_links
 T = TypeVar("T")
 
 
-class StepMaps(NamedTuple):
+class PlantAndMeasurementMaps(NamedTuple):
     """One step of the model as two maps: the plant's, x -> x+, and from the state to what arrives, x+ -> z."""
 
     plant: GainAndNoise
@@ -41,15 +41,17 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
         raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
 
 
-def make_step_maps(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[StepMaps]:
+def make_plant_and_measurement_maps(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int
+) -> list[PlantAndMeasurementMaps]:
     """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
-    plants = _convert_models(list_checked_steps(plant, horizon), order)
+    plants = _convert_to_affine_maps(list_checked_steps(plant, horizon), order)
     sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
         measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
     else:
         measurements = _make_measurement_maps(sensors, channels, order)
-    return [StepMaps(*pair) for pair in zip(plants, measurements, strict=True)]
+    return [PlantAndMeasurementMaps(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
 def _make_measurement_maps(
@@ -63,10 +65,10 @@ def _make_measurement_maps(
         apart += [] if by_link is None else [by_link]
     if len(apart) == len(sensors):
         return apart
-    return [Series(pair) for pair in zip(_convert_models(sensors, order), channels, strict=True)]
+    return [Series(pair) for pair in zip(_convert_to_affine_maps(sensors, order), channels, strict=True)]
 
 
-def _convert_models(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+def _convert_to_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """Return the map x -> A x + noise of each plant or sensor, with the noise's moments tabulated up to `order`.
 
     `check_model` has seen that all are linear. A model like the one before shares its map and table.

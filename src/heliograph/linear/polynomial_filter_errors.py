@@ -15,7 +15,7 @@ from heliograph.linear.monomial_lifted_system import (
     refuse_lift,
     split_homogeneous,
 )
-from heliograph.linear.plant_and_measurement_maps import check_model, make_step_maps
+from heliograph.linear.plant_and_measurement_maps import check_model, make_plant_and_measurement_maps
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
@@ -70,7 +70,7 @@ def quadratic_system_with_linear_estimate(
     mean, spread = mean_and_spread(second)
     received, cache = _make_received_products(n, m), _MomentCache()
     steps, rounding = list[Steps](), list[np.ndarray]()
-    for k, route in enumerate(make_step_maps(plant, sensor, channel, 4, horizon)):
+    for k, route in enumerate(make_plant_and_measurement_maps(plant, sensor, channel, 4, horizon)):
         # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
         move = cache.make_move_map(route.plant, m)
         measure_squares, measure_fourth = cache.make_measurement_moments(route.measurement, n)

@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
 from heliograph.linear.known_loss_stability import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
-from heliograph.linear.lmmse_recursion import step_covariance, take_noise_roots
+from heliograph.linear.lmmse_recursion import step_covariance_roots, take_noise_roots
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
@@ -180,7 +180,7 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     # One more correction and prediction gives the gain, and must come back to where it began.
     noises = take_noise_roots(step, np.diag(prior))
     gain, root = observe_root(roots_of(prior), c, noises.received)
-    again = covariance_of_root(step_covariance(root, step, noises).predicted)
+    again = covariance_of_root(step_covariance_roots(root, step, noises).predicted)
     unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
     if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ gain @ c) >= 1:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from heliograph.engine.choice import read_setting, try_native
+from heliograph.engine.choice import make_native_or_none, read_forced_engine
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.stored.old_layout import split_by_path
@@ -188,7 +188,7 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
     """
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_setting())
+    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_forced_engine())
 
 
 @lru_cache
@@ -227,7 +227,7 @@ def _compile_step(
         in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
-    return try_native(compile_code)
+    return make_native_or_none(compile_code)
 
 
 class DecidingSender(NamedTuple):

@@ -22,7 +22,7 @@ from heliograph.random_affine.modes import (
     OneStepLate,
     is_memory_irrelevant_for_linear_filter,
     joint_modes,
-    mix_maps,
+    mix_maps_of_modes,
     mode_laws_over_time,
     redraw_modes_each_step,
 )
@@ -202,7 +202,9 @@ def without_memory(channel: Channel) -> Channel:
     if not isinstance(channel, OverTime):
         return redraw_modes_each_step(channel)
     steps = [joint_modes(step, order=2) for step in unstack(channel)]
-    return over_time([mix_maps(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)])
+    return over_time(
+        [mix_maps_of_modes(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)]
+    )
 
 
 def memory_matters(channel: Channel) -> bool:

@@ -54,14 +54,14 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
     def evaluate(x: Compensated) -> Compensated:
         """Return f(high + low) as high + low, 0 where the low part is no number."""
         program = jax.make_jaxpr(function)(x.high)
-        result = _Evaluation(unit).evaluate_program(program, [x])[0]
+        result = _CompensatedEvaluation(unit).evaluate_program(program, [x])[0]
         low = jnp.zeros_like(result.high) if result.low is None else result.low
         return Compensated(jnp.asarray(result.high), jnp.where(jnp.isfinite(low), low, 0.0))
 
     return evaluate
 
 
-class _Evaluation:
+class _CompensatedEvaluation:
     """Evaluation of a traced program in numbers that are high + low."""
 
     def __init__(self, unit: float):
@@ -107,7 +107,7 @@ class _Evaluation:
             return self._apply_branches(inputs, params["branches"])
         if name in self.rules and all(jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in inputs):
             return [self.rules[name](*inputs, **params)]
-        return _differentiate(partial(_bind, equation), inputs, equation.primitive.multiple_results)
+        return _apply_to_first_order(partial(_apply_unchanged, equation), inputs, equation.primitive.multiple_results)
 
     def _apply_branches(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
         """Take one of several programs, each evaluated so."""
@@ -130,7 +130,7 @@ class _Evaluation:
     def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Add two numbers, with what the sum's rounding and theirs lost."""
         total, error = split_sum(a.high, b.high)
-        return Compensated(total, _add_up(error, a.low, b.low))
+        return Compensated(total, _sum_terms_present(error, a.low, b.low))
 
     def _subtract(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Subtract: add the negative."""
@@ -139,20 +139,20 @@ class _Evaluation:
     def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Multiply two numbers, with what the product's rounding and theirs lost."""
         lost = [x.low * y.high for x, y in ((a, b), (b, a)) if x.low is not None]
-        return Compensated(a.high * b.high, _add_up(self._find_product_error(a.high, b.high), *lost))
+        return Compensated(a.high * b.high, _sum_terms_present(self._find_product_error(a.high, b.high), *lost))
 
     def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Divide: the remainder a - q b, and what was lost of it, over b."""
         quotient = a.high / b.high
         back = quotient * b.high
         lost = None if b.low is None else -quotient * b.low
-        rest = _add_up((a.high - back) - _or_zero(self._find_product_error(quotient, b.high)), a.low, lost)
+        rest = _sum_terms_present((a.high - back) - _or_zero(self._find_product_error(quotient, b.high)), a.low, lost)
         return Compensated(quotient, rest / b.high)
 
     def _take_root(self, a: Compensated, **_: Any) -> Compensated:
         """Take a root: the remainder a - r^2, and what was lost of a, over 2 r."""
         root = jnp.sqrt(a.high)
-        rest = _add_up((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
+        rest = _sum_terms_present((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
         return Compensated(root, rest / (2 * root))
 
     def _square(self, a: Compensated, **_: Any) -> Compensated:
@@ -168,13 +168,13 @@ class _Evaluation:
     def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
         """Add the entries along axes, one after another."""
         for axis in sorted(axes, reverse=True):
-            parts = _take_apart(a, axis)
+            parts = _split_along_axis(a, axis)
             a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
         """Return the running sums along an axis, from its first entry on or from its last."""
-        parts = _take_apart(a, axis)
+        parts = _split_along_axis(a, axis)
         if reverse:
             for i in reversed(range(len(parts) - 1)):
                 parts[i] = self._add(parts[i + 1], parts[i])
@@ -194,7 +194,9 @@ class _Evaluation:
         shape = [shape_a[axis] for axis in batch_a]
         shape += [n for axis, n in enumerate(shape_a) if axis not in (*batch_a, *summed_a)]
         shape += [n for axis, n in enumerate(shape_b) if axis not in (*batch_b, *summed_b)]
-        products = [self._multiply(x, y) for x, y in zip(_take_apart(left, 1), _take_apart(right, 1), strict=True)]
+        products = [
+            self._multiply(x, y) for x, y in zip(_split_along_axis(left, 1), _split_along_axis(right, 1), strict=True)
+        ]
         if not products:
             return Compensated(jnp.zeros(shape))
         total = reduce(self._add, products)
@@ -202,7 +204,7 @@ class _Evaluation:
 
     def _find_product_error(self, a: Any, b: Any) -> Any:
         """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
-        if _is_scaling(a) or _is_scaling(b):
+        if _scales_without_rounding(a) or _scales_without_rounding(b):
             return None
         (a1, a2), (b1, b2) = self._split_digits(a), self._split_digits(b)
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
@@ -222,13 +224,15 @@ class _Evaluation:
         return high, a - high
 
 
-def _bind(equation: JaxprEqn, *arguments: Any) -> Any:
+def _apply_unchanged(equation: JaxprEqn, *arguments: Any) -> Any:
     """Apply an operation as it is."""
     primitive: Any = equation.primitive
     return primitive.bind(*arguments, **equation.params)
 
 
-def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], several: bool) -> list[Compensated]:
+def _apply_to_first_order(
+    function: Callable[..., Any], inputs: Sequence[Compensated], several: bool
+) -> list[Compensated]:
     """Return f of numbers in two parts, as numbers in two parts: f(high), and f'(high) low, to first order.
 
     A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was lost.
@@ -265,14 +269,14 @@ def _differentiate(function: Callable[..., Any], inputs: Sequence[Compensated], 
     ]
 
 
-def _is_scaling(a: Any) -> bool:
+def _scales_without_rounding(a: Any) -> bool:
     """Return whether a known number multiplies without rounding: each entry is 0 or a power of two."""
     if isinstance(a, jax.Array | jax.core.Tracer):
         return False
     return bool(np.all((np.abs(np.frexp(a)[0]) == 0.5) | (np.asarray(a) == 0)))
 
 
-def _take_apart(a: Compensated, axis: int) -> list[Compensated]:
+def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
     """Return the entries along an axis."""
     count = jnp.shape(a.high)[axis]
     parts = [[None] * count if x is None else [_take(x, i, axis) for i in range(count)] for x in a]
@@ -303,7 +307,7 @@ def _as_array(x: Any) -> Any:
     return x if x is None or isinstance(x, jax.Array) else np.asarray(x)
 
 
-def _add_up(*terms: Any) -> Any:
+def _sum_terms_present(*terms: Any) -> Any:
     """Return the sum of those terms that are not None."""
     given = [x for x in terms if x is not None]
     return reduce(lambda a, b: a + b, given) if given else None

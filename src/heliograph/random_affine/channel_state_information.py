@@ -20,7 +20,7 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
-from heliograph.random_affine.laws.gain_given_reading import check_density, gain_given_reading
+from heliograph.random_affine.laws.gain_given_reading import gain_given_reading, require_density
 from heliograph.random_affine.laws.gain_laws import AbstractLaw, CertainDiscrete, Constant, Discrete
 from heliograph.random_affine.markov_chain_and_autoregression import (
     AbstractMemory,
@@ -35,7 +35,7 @@ T = TypeVar("T")
 Numbers = Float[jax.Array | np.ndarray, " told"]
 
 
-class AbstractFresh(AbstractMemory):
+class AbstractFreshDraw(AbstractMemory):
     """What is drawn anew at each step and told to the receiver, so that nothing is left to remember."""
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
@@ -52,7 +52,7 @@ class AbstractFresh(AbstractMemory):
         raise fail("filter of a link whose gain or noise is told", expected, "one of joint modes")
 
 
-class FreshNumbers(AbstractFresh):
+class FreshNumbers(AbstractFreshDraw):
     """Numbers that are drawn anew at each step; a receiver is told all of them.
 
     Args:
@@ -85,7 +85,7 @@ class FreshNumbers(AbstractFresh):
         return jnp.reshape(self.law.sample(key), (self.count,))
 
 
-class FreshReading(AbstractFresh):
+class FreshReading(AbstractFreshDraw):
     """A gain that is drawn anew at each step, and its reading a = g + e, which alone the receiver is told.
 
     Args:
@@ -99,7 +99,7 @@ class FreshReading(AbstractFresh):
     identity: str = eqx.field(static=True)
 
     def __init__(self, law: AbstractLaw, variance: Float[Array, ""]):
-        self.law = check_density(law)
+        self.law = require_density(law)
         self.variance = scalar("noise of a pilot", variance, np.finfo(float).tiny)
         self.name, self.identity = None, identify_memory(None)
 
@@ -114,7 +114,7 @@ class FreshReading(AbstractFresh):
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
 
 
-class AbstractTold(AbstractModal):
+class AbstractMapWithToldNumbers(AbstractModal):
     """A map of which the receiver is told numbers with each message: `given` is the world's, `believed` the receiver's.
 
     names: names of the numbers. exogenous: whether they are independent of the state, so that they tell of the link
@@ -132,7 +132,7 @@ class AbstractTold(AbstractModal):
         said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
         return " and ".join(said)
 
-    def _say_told(self, what: str) -> str:
+    def _describe_told_numbers(self, what: str) -> str:
         """Return in brackets what is told, and what is not promised of it."""
         return f"(told {what}{', not exogenous' * (not self.exogenous)}{', not fresh' * (not self.fresh)})"
 
@@ -155,7 +155,7 @@ class AbstractTold(AbstractModal):
         return jnp.all(jnp.isfinite(numbers))
 
 
-class ToldMap(AbstractTold):
+class ToldMap(AbstractMapWithToldNumbers):
     """A map that is a function of the numbers that are told.
 
     Args:
@@ -239,7 +239,7 @@ class ToldMap(AbstractTold):
 
     def in_words(self) -> str:
         """Return the map of typical numbers in words, and what is told."""
-        return f"{self.believed(self.typical).in_words()} {self._say_told(', '.join(self.names))}"
+        return f"{self.believed(self.typical).in_words()} {self._describe_told_numbers(', '.join(self.names))}"
 
 
 class ToldGainHop(eqx.Module):
@@ -253,7 +253,7 @@ class ToldGainHop(eqx.Module):
         return GainAndNoise(Constant(numbers[0]), self.matrix, self.noise)
 
 
-class PilotedHop(AbstractHop, AbstractTold):
+class PilotedHop(AbstractHop, AbstractMapWithToldNumbers):
     """Hop z = g A y + n whose receiver is told a reading of its gain, as by a pilot: a = g + e.
 
     Args:
@@ -301,30 +301,30 @@ class PilotedHop(AbstractHop, AbstractTold):
     def in_words(self) -> str:
         """Return the hop in words, and what is told."""
         plain = GainAndNoise(self.memory.law, self.matrix, self.noise)
-        return f"{plain.in_words()} {self._say_told('a reading of its gain')}"
+        return f"{plain.in_words()} {self._describe_told_numbers('a reading of its gain')}"
 
 
-def told_maps(channel: AbstractRandomAffine) -> list[AbstractTold]:
+def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractMapWithToldNumbers]:
     """Return the maps in a channel of which numbers are told, one for each of the memories that draw them."""
-    by_identity: dict[str, AbstractTold] = {}
-    for leaf in jax.tree.leaves(channel, is_leaf=_is_told):
-        if _is_told(leaf):
+    by_identity: dict[str, AbstractMapWithToldNumbers] = {}
+    for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map):
+        if _is_told_map(leaf):
             by_identity.setdefault(leaf.memory.identity, leaf)
     return list(by_identity.values())
 
 
-def numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
+def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
     """Return which of the numbers told each output of a channel depends on: those of the map that it comes out of."""
-    identities = [affine.memory.identity for affine in told_maps(channel) for _ in range(affine.memory.announced)]
+    identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
     rows = list[list[bool]]()
     for part in channel.in_parallel:
-        own = {affine.memory.identity for affine in told_maps(part)}
+        own = {affine.memory.identity for affine in list_told_maps(part)}
         rows += [[identity in own for identity in identities]] * part.outputs
     return np.array(rows)
 
 
-def believe_told(channel: T, numbers: Numbers) -> T:
-    """Return the channel as a receiver knows it that is told these numbers, in the order of `told_maps`.
+def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
+    """Return the channel as a receiver knows it that is told these numbers, in the order of `list_told_maps`.
 
     Args:
         channel: a channel, whose other memories stay.
@@ -334,9 +334,9 @@ def believe_told(channel: T, numbers: Numbers) -> T:
 
     def believe(leaf: object) -> object:
         """Return a map as its receiver knows it given its numbers, anything else as it is."""
-        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractTold) else leaf
+        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractMapWithToldNumbers) else leaf
 
-    conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told)
+    conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
     return conditioned
 
 
@@ -348,14 +348,16 @@ def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Arr
         numbers: what is told of all its maps, one after another.
     """
     parts = _share_numbers_by_map(channel, numbers)
-    return jnp.all(jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in told_maps(channel)]))
+    return jnp.all(
+        jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in list_told_maps(channel)])
+    )
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
     """Return what is told of each map of a channel, by the identity of its memory."""
     assert isinstance(channel, AbstractRandomAffine)
     parts, start = dict[str, Numbers](), 0
-    for affine in told_maps(channel):
+    for affine in list_told_maps(channel):
         parts[affine.memory.identity] = numbers[start : start + affine.memory.announced]
         start += affine.memory.announced
     return parts
@@ -395,6 +397,6 @@ def make_certain(link: T) -> T:
     return known
 
 
-def _is_told(leaf: object) -> bool:
+def _is_told_map(leaf: object) -> bool:
     """Return whether an object is a map of which numbers are told."""
-    return isinstance(leaf, AbstractTold)
+    return isinstance(leaf, AbstractMapWithToldNumbers)

@@ -25,7 +25,7 @@ class AbstractWithMemory(Module):
         raise unwritten(self, "given")
 
 
-def select_alike(models: Sequence[T], state: jax.Array) -> T | None:
+def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T | None:
     """Return the model of a traced mode, with its numbers, of models that differ in numbers alone; else None."""
     leaves, trees = zip(*(jax.tree.flatten(model) for model in models), strict=True)
     if any(not eqx.is_array_like(leaf) for of_mode in leaves for leaf in of_mode):
@@ -62,8 +62,8 @@ def draw_with_shared_memories(
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     """Return the memories on which the modes of a map (or of all maps in a tree) depend, by identity, in order."""
-    parts = jax.tree.leaves(channel, is_leaf=is_modal)
-    return unique_memories(leaf.memory for leaf in parts if is_modal(leaf))
+    parts = jax.tree.leaves(channel, is_leaf=is_memory_dependent)
+    return unique_memories(leaf.memory for leaf in parts if is_memory_dependent(leaf))
 
 
 def condition_on_memories(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
@@ -79,13 +79,13 @@ def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.
 
     def condition(leaf: PyTree) -> PyTree:
         """Return a map with a memory as it is in the memory's state, anything else as it is."""
-        return leaf.given(by_identity[leaf.memory.identity]) if is_modal(leaf) else leaf
+        return leaf.given(by_identity[leaf.memory.identity]) if is_memory_dependent(leaf) else leaf
 
-    memoryless: T = jax.tree.map(condition, channel, is_leaf=is_modal)
+    memoryless: T = jax.tree.map(condition, channel, is_leaf=is_memory_dependent)
     return memoryless
 
 
-def is_modal(leaf: object) -> bool:
+def is_memory_dependent(leaf: object) -> bool:
     """Return True for a map whose law depends on the state of a memory."""
     return isinstance(leaf, AbstractWithMemory)
 
@@ -96,7 +96,7 @@ def drop_names(channel: T) -> T:
     return replace_memories(channel, {key: memory.labelled(str(i)) for i, (key, memory) in enumerate(held.items())})
 
 
-def drop_identities(model: T) -> T:
+def number_unnamed_memories(model: T) -> T:
     """Return the model with its unnamed memories called by their number: models that differ in these look alike."""
     held = enumerate(memories(model).items())
     twins = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in held if memory.name is None}
@@ -131,9 +131,9 @@ def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
 
     def replace(leaf: PyTree) -> PyTree:
         """Return a map with a memory with the other memory in its place, anything else as it is."""
-        if not is_modal(leaf) or leaf.memory.identity not in twins:
+        if not is_memory_dependent(leaf) or leaf.memory.identity not in twins:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])
 
-    exchanged: T = jax.tree.map(replace, channel, is_leaf=is_modal) if twins else channel
+    exchanged: T = jax.tree.map(replace, channel, is_leaf=is_memory_dependent) if twins else channel
     return exchanged

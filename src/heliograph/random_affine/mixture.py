@@ -11,7 +11,7 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.numpy_or_jax import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
+from heliograph.random_affine.composite import DIRECT, AbstractOneOfSeveralMaps, write_percentage
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.laws.gain_laws import Constant, Discrete
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, mix_gains
@@ -22,7 +22,7 @@ from heliograph.random_affine.noise import Gaussian, Matrix
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners
 
 
-class Mixture(AbstractUniform, AbstractCombination):
+class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
     """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
 
     Args:
@@ -102,8 +102,8 @@ class Mixture(AbstractUniform, AbstractCombination):
         """Return the maps in words, with their shares; of a map and silence, a loss that nobody notices."""
         parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(parts) == 2 and parts[1] == NOTHING_SENT:
-            return f"{parts[0]}, {percent_in_words(shares[1])} lost unnoticed"
-        choices = (f"{words} ({percent_in_words(p)})" for words, p in zip(parts, shares, strict=True))
+            return f"{parts[0]}, {write_percentage(shares[1])} lost unnoticed"
+        choices = (f"{words} ({write_percentage(p)})" for words, p in zip(parts, shares, strict=True))
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:

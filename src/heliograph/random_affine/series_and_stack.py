@@ -22,7 +22,7 @@ from heliograph.random_affine.base import (
     check_forgets,
     check_maps,
 )
-from heliograph.random_affine.composite import ARROW, AbstractComposite, list_in_words
+from heliograph.random_affine.composite import ARROW, AbstractComposite, describe_maps_side_by_side
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, stack_on_shared_inputs
 from heliograph.random_affine.moments.interval_products import (
@@ -294,7 +294,7 @@ class Stack(AbstractCombination):
 
     def in_words(self) -> str:
         """Return the maps in words, between bars."""
-        return list_in_words(self.maps)
+        return describe_maps_side_by_side(self.maps)
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Return the stack without the noises of its maps where their laws have outliers, and these noises."""

@@ -13,7 +13,7 @@ from heliograph.numerics.check import check_count, fail, instance, items, show_v
 from heliograph.numerics.numpy_or_jax import library, scatter
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.composite import list_in_words
+from heliograph.random_affine.composite import describe_maps_side_by_side
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.gain_laws import Constant
 from heliograph.random_affine.memories_of_channels import memories
@@ -98,7 +98,7 @@ class Superposed(AbstractCombination):
         total = np.tile(np.eye(self.outputs), (1, len(self.maps)))
         return Series([stack, GainAndNoise(Constant(1.0), total, self.noise)])
 
-    def in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
+    def sum_in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
         """Return the sum of arrays of some of the maps, each put at the places in (y, 1) of what its map takes.
 
         parts: arrays by number of the map, whose last `axes` (1 or 2) have the length of (y_i, 1).
@@ -167,7 +167,7 @@ class Superposed(AbstractCombination):
 
     def in_words(self) -> str:
         """Return the sum of the maps in words."""
-        return f"sum of {list_in_words(self.maps)}"
+        return f"sum of {describe_maps_side_by_side(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Return the sum without the receiver's noise where its law has outliers, and that noise; else None for it."""
@@ -196,7 +196,7 @@ class Superposed(AbstractCombination):
         return _assemble_moments(powers, self.outputs, self.inputs, order)
 
 
-class _SumPowers(NamedTuple):
+class _SumMoments(NamedTuple):
     """Powers of a sum t of maps: E[t^a | y] at each corner, by degree |a|, homogeneous polynomials in (y, 1).
 
     places: of the components of y on which t depends, in order; by_degree: each (corners, monomials of t, monomials).
@@ -206,7 +206,7 @@ class _SumPowers(NamedTuple):
     by_degree: list[Corners]
 
 
-def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _SumPowers:
+def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _SumMoments:
     """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner.
 
     Args:
@@ -220,21 +220,21 @@ def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _S
     sorted_place = np.array([ordered.index(i) for i in places] + [len(places)])
     by_degree = [library(matrix).ones((len(matrix), 1, 1))]
     for degree in range(1, order + 1):
-        rows, columns = _find_degree(outputs, degree, order), times_one(variables, degree, order)
+        rows, columns = _find_monomials_of_degree(outputs, degree, order), times_one(variables, degree, order)
         # The place of each monomial among those of the sorted variables; then, by argsort, which one has each place.
         place = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
         by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place)]])
-    return _SumPowers(ordered, by_degree)
+    return _SumMoments(ordered, by_degree)
 
 
 @cache_arrays
-def _find_degree(outputs: int, degree: int, order: int) -> np.ndarray:
+def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarray:
     """Return the positions at `order` of the monomials of z alone of this degree, times powers of 1."""
     alone = factor_variables(outputs, degree)
     return place_monomials(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
 
 
-def _sum_by_halves(terms: Sequence[_SumPowers], outputs: int) -> _SumPowers:
+def _sum_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
     """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
     if len(terms) == 1:
         return terms[0]
@@ -242,7 +242,7 @@ def _sum_by_halves(terms: Sequence[_SumPowers], outputs: int) -> _SumPowers:
     return _add_powers(_sum_by_halves(terms[:middle], outputs), _sum_by_halves(terms[middle:], outputs), outputs)
 
 
-def _add_powers(a: _SumPowers, b: _SumPowers, outputs: int) -> _SumPowers:
+def _add_powers(a: _SumMoments, b: _SumMoments, outputs: int) -> _SumMoments:
     """Return the powers of a sum t + r of independent maps at each pair of corners, those of t slowest.
 
     E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y].
@@ -262,7 +262,7 @@ def _add_powers(a: _SumPowers, b: _SumPowers, outputs: int) -> _SumPowers:
             rows = scatter((count_monomials(outputs, degree), len(where), corners), row, products.transpose(1, 2, 0))
             total = total + scatter((count_monomials(size, degree), *rows.shape[::2]), where, rows.swapaxes(0, 1))
         by_degree.append(total.transpose(2, 1, 0))
-    return _SumPowers(places, by_degree)
+    return _SumMoments(places, by_degree)
 
 
 @cache_arrays
@@ -289,14 +289,14 @@ def _place_products(a: Places, b: Places, first: int, second: int, size: int) ->
     return place_monomials(np.concatenate(both, axis=-1), size)
 
 
-def _assemble_moments(powers: _SumPowers, outputs: int, inputs: int, order: int) -> Corners:
+def _assemble_moments(powers: _SumMoments, outputs: int, inputs: int, order: int) -> Corners:
     """Return E[Sym^order(H)] at each corner from the polynomials of each degree."""
     size, corners = len(powers.places) + 1, len(powers.by_degree[0])
     names = np.array([*powers.places, inputs])
     xp = library(powers.by_degree)
     matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
     for degree, polynomials in enumerate(powers.by_degree):
-        rows = _find_degree(outputs, degree, order)
+        rows = _find_monomials_of_degree(outputs, degree, order)
         chosen = np.pad(names[factor_variables(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
         columns = place_monomials(chosen, inputs + 1)
         if xp is np:

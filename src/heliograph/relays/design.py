@@ -20,11 +20,11 @@ from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.error_moments import (
-    Propagated,
+    PropagatedMoments,
     correct_moments,
     initial_error_moments,
     linear_maps,
-    propagate_slots,
+    propagate_error_moments,
     step_moments,
 )
 
@@ -75,7 +75,7 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     return make_design(network, _propagate(steps, start_moments(network), joined))
 
 
-_propagate = compile_in_float64(propagate_slots)
+_propagate = compile_in_float64(propagate_error_moments)
 
 
 def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
@@ -108,7 +108,7 @@ def split_gains(
     }
 
 
-def make_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
+def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
     """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):

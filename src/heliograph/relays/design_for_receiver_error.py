@@ -28,7 +28,7 @@ from heliograph.relays.error_moments import (
     gain_mask,
     minimise_cost_ahead,
     moment_adjoint,
-    propagate_slots,
+    propagate_error_moments,
     step_moments,
 )
 
@@ -78,12 +78,12 @@ def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
         text = f"more than {fixed[step]:.6g} at step {step}, the power of the mean state"
         raise fail("power limit", text, limit[step] / (1 + POWER_TOLERANCE))
     # What is left for the moments: those after step k are sent at step k + 1; 0 <= 1 where nobody sends.
-    forms = power_forms(steps, d)
+    forms = make_power_matrices(steps, d)
     left = np.where(transmitting > 0, limit - fixed, 1.0)
     return PowerLimit(form=np.concatenate([forms[1:], np.zeros((1, d, d))]), limit=np.append(left[1:], 1.0))
 
 
-def power_forms(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
+def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Return the matrices with <form_k, moments before step k> = sum over transmitting relays of tr Cov(C s_r)."""
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -116,7 +116,7 @@ def minimise_within_limit(
     for barrier in BARRIERS / len(local_gains):
         gains = designs[-1]
         # The variables x (time, r): changes of the r free gains of each step, in units in which the cost curves alike.
-        units = np.asarray(_choose_units(problem, gains, barrier))
+        units = np.asarray(_choose_step_units(problem, gains, barrier))
         evaluate = partial(_evaluate_barrier, problem, gains, units, barrier)
         shape = units.shape[:2]
         x = bfgs(
@@ -163,7 +163,7 @@ def _compute_cost_and_slack(
     problem: LimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """Return the cost of given gains, and the share of each limit that they leave free."""
-    moments = propagate_slots(problem.steps, problem.start, gains).moments[1:]
+    moments = propagate_error_moments(problem.steps, problem.start, gains).moments[1:]
     form, limit = problem.power
     return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
 
@@ -203,7 +203,7 @@ def _evaluate_barrier(
 
 
 @compile_in_float64
-def _choose_units(
+def _choose_step_units(
     problem: LimitedProblem, gains: Float[Array, "time Fn R"], barrier: float
 ) -> Float[Array, "time r r"]:
     """Return units (columns) of the r free gains of each step, in which the cost curves alike in all directions.
@@ -213,7 +213,7 @@ def _choose_units(
     last.
     """
     steps, start, cost, (form, limit) = problem
-    moments = jnp.asarray(propagate_slots(steps, start, gains).moments)
+    moments = jnp.asarray(propagate_error_moments(steps, start, gains).moments)
     # Cost and barrier of step k alone, by the moments after it: d/dp of -t log(limit - p) is t / (limit - p).
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
     own_gradient = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
@@ -340,7 +340,7 @@ def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax
     return jax.lax.scan(improve_step, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
-class SweepSearch(NamedTuple):
+class SweepState(NamedTuple):
     """Gains of the sweep, and the best gains with their cost: rounding may raise it at the end."""
 
     gains: Float[jax.Array, "time Fn R"]
@@ -358,15 +358,15 @@ def _alternate_sweeps(
 ) -> Float[Array, "time Fn R"]:
     """Alternate backward and forward sweeps from the local gains, `count` of them, and return the best gains."""
 
-    def sweep(search: SweepSearch, _: jax.Array) -> tuple[SweepSearch, None]:
+    def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
         """Sweep backward and forward once; keep the best gains so far with their cost."""
         gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost
         best = jnp.where(better, gains, search.best)
-        return SweepSearch(gains, best, jnp.where(better, value, search.cost)), None
+        return SweepState(gains, best, jnp.where(better, value, search.cost)), None
 
     first = jnp.asarray(local_gains)
-    value = jnp.sum(cost * propagate_slots(steps, start, first).moments[1:])
-    search, _ = jax.lax.scan(sweep, SweepSearch(first, first, value), jnp.asarray(count))
+    value = jnp.sum(cost * propagate_error_moments(steps, start, first).moments[1:])
+    search, _ = jax.lax.scan(sweep, SweepState(first, first, value), jnp.asarray(count))
     return search.best

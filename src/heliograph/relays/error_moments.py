@@ -143,7 +143,7 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
     return gain
 
 
-class Propagated(NamedTuple):
+class PropagatedMoments(NamedTuple):
     """Gains, the covariance of eta before and after each step, and the power of each sender."""
 
     gains: Float[Array, "time Fn R"]
@@ -151,9 +151,9 @@ class Propagated(NamedTuple):
     power: Float[Array, "time senders"]
 
 
-def propagate_slots(
+def propagate_error_moments(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
-) -> Propagated:
+) -> PropagatedMoments:
     """Propagate the covariance of eta = (x, e_1 ... e_F) over the steps; return it with gains and powers over time.
 
     Args:
@@ -174,7 +174,7 @@ def propagate_slots(
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))
     _, (gains, moments, power) = jax.lax.scan(move, start, items)
-    return Propagated(gains, jnp.concatenate([start[None], moments]), power)
+    return PropagatedMoments(gains, jnp.concatenate([start[None], moments]), power)
 
 
 DAMPING = 1e-9  # relative, on the change of a gain: decides only what the receiver's error does not

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.linear.jump_system import make_entry_matrix, propagate_by_mode, solve_fixed_point
+from heliograph.linear.jump_system import make_matrix_on_triangle_entries, propagate_by_mode, solve_fixed_point
 from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import fail, instance
@@ -25,7 +25,7 @@ from heliograph.relays.design import (
     split_gains,
     start_moments,
 )
-from heliograph.relays.error_moments import Propagated, correct_moments, propagate_slots, regression_gain
+from heliograph.relays.error_moments import PropagatedMoments, correct_moments, propagate_error_moments, regression_gain
 from heliograph.relays.power_limited_descent import Cost, make_penalised_cost, minimise_over_gains
 
 CONVERGED = 1e-13  # relative change of the moments over a period
@@ -85,7 +85,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined = join_gains(network, gains)
-    return make_design(network, _steady(_check_converging(network, joined), joined))
+    return make_design(network, _steady(_return_converging_steps(network, joined), joined))
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
@@ -100,12 +100,12 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined, n = relay_gains(network, gains), len(network.states)
-    return np.asarray(_steady_behind(_check_converging(network, joined), joined))[:, :n, :n]
+    return np.asarray(_steady_behind(_return_converging_steps(network, joined), joined))[:, :n, :n]
 
 
-def _check_converging(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
+def _return_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
     """Return the steps of one period, checked for gains under which the second moments converge."""
-    check_slots(network, gains)
+    check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
     radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
     if not radius < 1:
@@ -113,7 +113,7 @@ def _check_converging(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn 
     return steps
 
 
-def check_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> None:
+def check_gains_of_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> None:
     """Raise ValueError where there is not one gain for each slot."""
     if len(gains) != len(network.slots):
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
@@ -125,11 +125,11 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
     return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
 
 
-def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Propagated:
+def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> PropagatedMoments:
     """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    start = affine_fixed_point(lambda m: propagate_slots(steps, m, gains).moments[-1], d)
-    return propagate_slots(steps, start, gains)
+    start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
+    return propagate_error_moments(steps, start, gains)
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
@@ -198,20 +198,22 @@ _steady_behind = compile_in_float64(steady_receiver_covariance)
 def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Return the linear part of the map of second moments over one period, a matrix on their entries."""
     d = gains.shape[1] + steps.transition.shape[-1]
-    _, linear = jax.linearize(lambda m: propagate_slots(steps, m, gains).moments[-1], jnp.zeros((d, d)))
-    return jnp.asarray(make_entry_matrix(jax.vmap(linear), (d, d)))
+    _, linear = jax.linearize(lambda m: propagate_error_moments(steps, m, gains).moments[-1], jnp.zeros((d, d)))
+    return jnp.asarray(make_matrix_on_triangle_entries(jax.vmap(linear), (d, d)))
 
 
 @compile_in_float64
-def _iterate_local_design(steps: RelaySteps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
+def _iterate_local_design(
+    steps: RelaySteps, start: Float[Array, "d d"]
+) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
     """Repeat the period of the local design until its moments change by less than CONVERGED.
 
     Returns gains, moments and power over the last period, and the last relative change of the moments.
     """
     moments, change = _repeat_until_steady(
-        lambda m: propagate_slots(steps, m).moments[-1], jnp.asarray(start), CONVERGED
+        lambda m: propagate_error_moments(steps, m).moments[-1], jnp.asarray(start), CONVERGED
     )
-    return propagate_slots(steps, moments), change
+    return propagate_error_moments(steps, moments), change
 
 
 def _repeat_until_steady(
@@ -293,7 +295,7 @@ def _tune_gains(
 ) -> Float[np.ndarray, "slots Fn R"]:
     """Return the gains of least cost near `start`, checked to be one for each slot."""
     steps = periodic_steps(network)
-    check_slots(network, start)
+    check_gains_of_slots(network, start)
     return minimise_over_gains(network, steps, start, free, cost, power_limit)
 
 

@@ -128,9 +128,14 @@ def _penalise_power(
 
 
 def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
-    """Return the function that computes the penalised cost of a period's gains, its gradient and their powers.
+    """Return a compiled function that gives a period's gains their cost, its gradient, and the power of each slot.
 
-    `traces(steps, gains)` returns tr P of each slot, whether the moments converge, and the power of each slot.
+    The cost is log sum_s tr P_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, the augmented Lagrangian of power limits
+    g_s = power_s / limit_s - 1 <= 0 over the slots s of a period; infinite where the moments do not converge.
+
+    Args:
+        traces: `traces(steps, gains)` returns tr P_s of each slot (slots,), whether the moments converge, and the power
+            of each slot (slots,).
     """
 
     def evaluate(
@@ -142,9 +147,16 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
         limit: Array,
         multipliers: Array,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the penalised cost of the gains `base` + x `unit` at `where`, its gradient, and the slots' powers.
+        """Return the penalised cost of gains, its gradient by x (n,), and the slots' powers (slots,).
 
-        `limit` and `multipliers` are those of each slot's power in `_penalise_power`.
+        Args:
+            x: changes of the n free entries of the gains (n,), in units of `unit`.
+            steps: steps of a period.
+            base: gains that x changes (slots, F n, R).
+            where: places of the free entries in them, one array of indices (n,) for each axis.
+            unit: size of each free entry (n,).
+            limit: greatest power of each slot (slots,).
+            multipliers: lambda_s (slots,).
         """
 
         def compute_cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:

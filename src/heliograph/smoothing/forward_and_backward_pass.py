@@ -40,11 +40,13 @@ def smoother_steps(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)
     first = np.asarray(check_count("first step", first_step, 0))
-    return step_rows(filter, z, u, filter.init() if state is None else state, first)
+    return filter_rows_with_smoother_steps(filter, z, u, filter.init() if state is None else state, first)
 
 
 @compile_on_call
-def step_rows(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, SmootherStep]:
+def filter_rows_with_smoother_steps(
+    filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
+) -> tuple[PyTree, SmootherStep]:
     """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
@@ -54,7 +56,7 @@ def step_rows(filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: 
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
 
 
-def plan_with_past(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
+def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
     """Plan the filter for these inputs and complete data, with its smoother steps but for their data."""
     planned = filter.planned(inputs)
     if planned is filter:
@@ -68,7 +70,7 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
     Their covariances and gains are those of all data; their means stand in for those that data will give.
     """
     zeros = jnp.zeros((len(inputs), filter.received))
-    steps: SmootherStep = step_rows(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
+    steps: SmootherStep = filter_rows_with_smoother_steps(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
     return steps
 
 

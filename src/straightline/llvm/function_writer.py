@@ -192,7 +192,9 @@ class FunctionWriter:
             return first
         return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
 
-    def _locate(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
+    def _write_entry_address(
+        self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str
+    ) -> str:
         """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
         base = self._write_base(owner)
@@ -237,7 +239,7 @@ class FunctionWriter:
             return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
             return self.write_broadcast(self._write_scalar_load(node), node.type)
-        address = self._locate(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
+        address = self._write_entry_address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
         return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
@@ -246,7 +248,7 @@ class FunctionWriter:
         """Load a number that all lanes share."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
-        address = self._locate(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
+        address = self._write_entry_address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
@@ -276,7 +278,7 @@ class FunctionWriter:
         """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
-        address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
+        address = self._write_entry_address(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:  # of doubles
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"

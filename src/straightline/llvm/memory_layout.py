@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from straightline.llvm.function_writer import count_turns, list_loops_around
 from straightline.llvm.operations import BITS
 from straightline.nodes import REAL, Buffer, Node, Unsupported
-from straightline.program import Program, SummedOutputs, find_differing, list_used_nodes
+from straightline.program import Program, SummedOutputs, find_differing_items, list_used_nodes
 from straightline.vectors.elementary_functions import FUNCTIONS
 
 LINE = 64  # bytes: where vectors of any width may start
@@ -56,7 +56,7 @@ class ProgramParts(NamedTuple):
         return [b for b, is_sum in pairs if is_sum and b in self.spread]
 
 
-def divide_program(
+def split_shared_from_differing(
     program: Program,
     items: list[Any],
     outputs: list[Buffer],
@@ -79,7 +79,7 @@ def divide_program(
     lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
     # What differs between runs. One run alone computes all in the function of blocks, so all counts as differing; but
     # tables are constants, which never do.
-    spread = {*items, *program.inputs} if alone else find_differing(items, lanes)
+    spread = {*items, *program.inputs} if alone else find_differing_items(items, lanes)
     spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
     return ProgramParts(
         program=program,

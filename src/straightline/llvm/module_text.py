@@ -11,28 +11,41 @@ import numpy as np
 
 from straightline.constant_folding import DTYPES
 from straightline.llvm.function_writer import FunctionWriter, SharedSlots, count_turns
-from straightline.llvm.memory_layout import FILLED, LINE, MemoryLayout, ProgramParts, divide_program, lay_out_memory
+from straightline.llvm.memory_layout import (
+    FILLED,
+    LINE,
+    MemoryLayout,
+    ProgramParts,
+    lay_out_memory,
+    split_shared_from_differing,
+)
 from straightline.llvm.operations import BITS
 from straightline.llvm.prefetch import PrefetchedRows, count_lines_per_turn, find_longest_loop
-from straightline.llvm.transposition import FEW, Move, write_mover
-from straightline.llvm.vector_types_and_gathers import WIDTH, write_flush, write_gather, write_lane_numbers, write_types
+from straightline.llvm.transposition import FEW, MoverOptions, write_mover
+from straightline.llvm.vector_types_and_gathers import (
+    WIDTH,
+    write_gather,
+    write_lane_numbers,
+    write_subnormal_flush,
+    write_vector_types,
+)
 from straightline.lowering import Lowering, Value, refuse_failures
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
-from straightline.periodic_loop_values import keep_cycles
+from straightline.periodic_loop_values import reuse_recurring_values
 from straightline.program import (
     Program,
     SummedOutputs,
     find_crossing_items,
     find_fusable_products,
-    list_needed,
-    row_length,
+    list_needed_items,
+    row_length_of_sums,
     sort_items,
 )
 from straightline.rules.loops import copy_in_memory
 from straightline.rules.random_bits import write_hash_function
 from straightline.size_limits import LONGEST, TABLE
-from straightline.strided_arrays import InMemory, contiguous_strides
-from straightline.vectors.elementary_functions import write_functions
+from straightline.strided_arrays import StridedArray, contiguous_strides
+from straightline.vectors.elementary_functions import write_elementary_functions
 
 SQUARED = ("f64", "i64", "u64", "f32")  # types whose arrays are long enough, or wide, to be moved in squares
 
@@ -53,7 +66,7 @@ class FunctionSource(NamedTuple):
     def text(self, width: int) -> str:
         """Return the text for vectors of so many runs."""
         body = zlib.decompress(self.compressed).decode()
-        return "\n".join([write_types(width), *(helper(width) for helper in self.helpers), body])
+        return "\n".join([write_vector_types(width), *(helper(width) for helper in self.helpers), body])
 
 
 class OutputShape(NamedTuple):
@@ -99,13 +112,13 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
     lowering.graph = program.graph
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
-        must_store = number in last or not isinstance(value, InMemory)
+        must_store = number in last or not isinstance(value, StridedArray)
         stored = _store_in_memory(lowering, value) if must_store else _find_or_copy(lowering, value, results)
         results.append(stored.buffer)
     return results
 
 
-def _find_or_copy(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
+def _find_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
     """Return an array's buffer if it is all of one that the program filled; else copy the array."""
     buffer = value.buffer
     whole = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
@@ -116,14 +129,14 @@ def _find_or_copy(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> I
     return _store_in_memory(lowering, value) if value.size <= TABLE else copy_in_memory(lowering, value)
 
 
-def _store_in_memory(lowering: Lowering, value: Value) -> InMemory:
+def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
     """Return an array stored entry by entry in new memory, constants too."""
     flat: list[Node] = lowering.nodes(value).ravel().tolist()
-    type: Type = value.type if isinstance(value, InMemory) else flat[0].type
+    type: Type = value.type if isinstance(value, StridedArray) else flat[0].type
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
     for index, node in enumerate(flat):
         lowering.graph.store(buffer, node, index, (), ())
-    return InMemory.whole(buffer)
+    return StridedArray.whole(buffer)
 
 
 @refuse_failures("the text of a program")
@@ -153,9 +166,9 @@ def write_module(
         Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
     outputs = choose_output_buffers(program, last)
-    items = sort_items(keep_cycles(program.graph, outputs) if alone else list_needed(outputs))
+    items = sort_items(reuse_recurring_values(program.graph, outputs) if alone else list_needed_items(outputs))
     counts = _count_operations(items)
-    parts = divide_program(program, items, outputs, differing, width, alone, summed)
+    parts = split_shared_from_differing(program, items, outputs, differing, width, alone, summed)
     # The items of the function of blocks, and where the numbers lie.
     of_blocks = find_crossing_items(items, parts.spread)
     layout = lay_out_memory(parts, of_blocks)
@@ -164,10 +177,10 @@ def write_module(
     slots = SharedSlots(layout.shared)
     products = find_fusable_products(items) if fuse else set()
     writer = FunctionWriter(single=alone, mine=of_blocks, products=products, spread=parts.spread, slots=slots)
-    writer.turning, writer.flushes = layout.turning, _is_single(items)
-    blocks = _write_blocks(writer, parts, layout)
+    writer.turning, writer.flushes = layout.turning, _is_single_precision(items)
+    blocks = _write_block_function(writer, parts, layout)
     # The other function, written after it, fills just these slots, once for all runs.
-    once = _write_once(writer, parts, layout)
+    once = _write_shared_function(writer, parts, layout)
     tables = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in parts.tables if b.table is not None]
     program.graph.top.free_contents()
     return ModuleText(
@@ -194,7 +207,7 @@ def _count_operations(items: Iterable[Any]) -> Counter[str]:
     return counts
 
 
-def _is_single(items: Iterable[Any]) -> bool:
+def _is_single_precision(items: Iterable[Any]) -> bool:
     """Return whether real numbers are all of single precision."""
     types_ = {x.type for x in items if isinstance(x, Node)}
     return "f32" in types_ and "f64" not in types_
@@ -210,10 +223,10 @@ def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[
     work = sum(count * turns[block] for block, count in counts.items())
     helpers: list[Callable[[int], str]] = [*others, *(partial(write_gather, *kind) for kind in sorted(writer.gathered))]
     if writer.flushes:
-        helpers.append(write_flush)
+        helpers.append(write_subnormal_flush)
     called = writer.called - {"threefry"}
     if called:
-        helpers.append(partial(write_functions, called))
+        helpers.append(partial(write_elementary_functions, called))
     if "threefry" in writer.called:  # its text is the same for each count of lanes, so it is part of the text
         text = f"{write_hash_function()}\n{text}"
     compressed = zlib.compress(text.encode(), 1)
@@ -223,7 +236,7 @@ def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[
 HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
 
 
-def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
+def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource:
     """Return the function for blocks `begin` to `end` of W runs: transpose inputs, compute, transpose outputs back.
 
     Callers' arrays have the numbers of a run one after another; a thread's scratch memory has each number of a block's
@@ -244,13 +257,15 @@ def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLay
     transposed = set() if parts.alone else {b for b in layout.in_scratch if b.size}
     moved_inputs = [b for b in parts.lanes if b in transposed]
     moved_outputs = [b for b in parts.outputs if b in transposed]
-    movers = {_write_move(writer, names, buffer, "take") for buffer in moved_inputs}
+    movers = {_write_mover_call(writer, names, buffer, "take") for buffer in moved_inputs}
     _request_rows_ahead(writer, parts, names, moved_inputs, moved_outputs)
     if parts.summed is not None:
         number = parts.program.inputs[parts.summed.number]
         _add_to_sums(writer, parts.summed, names, number, parts.added, parts.width)
     writer.write_block(parts.program.graph.top)
-    movers |= {_write_move(writer, names, buffer, "give") for buffer in moved_outputs if buffer not in writer.sums}
+    movers |= {
+        _write_mover_call(writer, names, buffer, "give") for buffer in moved_outputs if buffer not in writer.sums
+    }
     # Next block.
     writer.line("br label %done")
     writer.start_basic_block("done")
@@ -260,15 +275,15 @@ def _write_blocks(writer: FunctionWriter, parts: ProgramParts, layout: MemoryLay
     writer.start_basic_block("exit")
     helpers: list[Callable[[int], str]] = [] if parts.summed is None else [write_lane_numbers]
     helpers += [partial(write_mover, move) for move in sorted(movers)]
-    return _finish_source(_write_run("\n".join(writer.lines), writer), writer, helpers)
+    return _finish_source(_write_run_function("\n".join(writer.lines), writer), writer, helpers)
 
 
-def _write_move(
+def _write_mover_call(
     writer: FunctionWriter, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
-) -> Move:
+) -> MoverOptions:
     """Write the call that takes a buffer's rows into lanes or gives them back; return what it calls."""
     few = buffer.size if buffer.size < FEW else 0
-    called = Move(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
+    called = MoverOptions(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
     pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
     writer.line(f"call void @{called.name}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
     return called
@@ -306,9 +321,9 @@ def _add_to_sums(
 ) -> None:
     """Make the writer's stores to these outputs add to sums over runs.
 
-    A row of sums has a place for each batch and some more (`row_length`). Of each `width` consecutive runs, the most
-    that a vector has, the first adds to the place of its batch, run number mod batches, and the others to the places
-    behind it: so sums have the same bits however many runs a vector has.
+    A row of sums has a place for each batch and some more (`row_length_of_sums`). Of each `width` consecutive runs, the
+    most that a vector has, the first adds to the place of its batch, run number mod batches, and the others to the
+    places behind it: so sums have the same bits however many runs a vector has.
 
     Args:
         writer: of the function of blocks, at the beginning of a block.
@@ -332,10 +347,10 @@ def _add_to_sums(
     writer.counted_lanes = writer.add(f"icmp ult %i64 {writer.add('call %i64 @hg_lanes()')}, {runs_left}")
     for buffer in outputs:
         writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {place}")
-        writer.sums[buffer] = row_length(width, summed.batches)
+        writer.sums[buffer] = row_length_of_sums(width, summed.batches)
 
 
-def _write_once(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
+def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayout) -> FunctionSource | None:
     """Return the function that computes what all runs share; None if neither blocks nor a caller need any of it.
 
     `blocks` is the writer of the function of blocks, which has been written: it knows what that one reads.
@@ -344,15 +359,15 @@ def _write_once(blocks: FunctionWriter, parts: ProgramParts, layout: MemoryLayou
     roots: list[Any] = [*blocks.slots.places, *(b for b in blocks.read if b.kind in FILLED), *shared_outputs]
     if not roots:
         return None
-    needed = list_needed(roots)
+    needed = list_needed_items(roots)
     writer = FunctionWriter(single=True, mine=needed, products=blocks.products, spread=set(), slots=blocks.slots)
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
     _write_pointers(writer, parts.pointers, layout.in_shared)
     writer.write_block(parts.program.graph.top)
-    return _finish_source(_write_run("\n".join(writer.lines), writer), writer, [])
+    return _finish_source(_write_run_function("\n".join(writer.lines), writer), writer, [])
 
 
-def _write_run(body: str, writer: FunctionWriter) -> str:
+def _write_run_function(body: str, writer: FunctionWriter) -> str:
     """Return the function `run` around its body; in single precision alone, subnormal numbers are zeros in it."""
     before = after = ""
     if writer.flushes:

@@ -39,7 +39,7 @@ class TextLines:
         self.lines += [f"  br label %{head}", f"{after}:"]
 
 
-class Move(NamedTuple):
+class MoverOptions(NamedTuple):
     """What a mover moves: numbers of so many bits, to lanes or back, and how.
 
     `squared`: in squares. `few`: entries of a run where they are fewer than FEW, 0 where they are not.
@@ -57,7 +57,7 @@ class Move(NamedTuple):
         return f"{kind}x{self.few}" if self.few else kind
 
 
-def write_mover(move: Move, width: int) -> str:
+def write_mover(move: MoverOptions, width: int) -> str:
     """Return the LLVM text of `void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or of `give64`.
 
     `take` moves arrays [run][entry], of `size` entries a run, to [entry][lane]; `give` moves them back. Lane l is run
@@ -93,7 +93,7 @@ def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
     return rows
 
 
-def _write_register_mover(text: TextLines, move: Move, side: int, width: int) -> None:
+def _write_register_mover(text: TextLines, move: MoverOptions, side: int, width: int) -> None:
     """Write the move of few entries of a block in which each lane has a run of its own, and the return after it.
 
     The runs of a group, `side` of them, have all their entries one after another in memory. These are loaded as whole

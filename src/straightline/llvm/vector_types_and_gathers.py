@@ -7,7 +7,7 @@ from straightline.llvm.transposition import TextLines
 
 
 @cache
-def write_types(width: int) -> str:
+def write_vector_types(width: int) -> str:
     """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
     vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "float", "i64", "i32", "i8", "i1")]
     return "".join([*vectors, f"%lanes = type i{width}\n"])
@@ -51,7 +51,7 @@ FLUSH = 0x8040  # of the control word of x86: results and arguments that are sub
 X86 = ("x86_64", "amd64", "i386", "i686")
 
 
-def write_flush(width: int) -> str:
+def write_subnormal_flush(width: int) -> str:
     """Return the LLVM text of two functions, `i32 @hg_flush()` and `void @hg_restore(i32)`.
 
     After the first, the processor takes subnormal numbers for zeros; it returns the processor's former state, which the

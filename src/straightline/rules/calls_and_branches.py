@@ -71,7 +71,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
         return lowering.inline_program(branches[0], inputs[1:])
     # Small branches are computed in any case, large ones in guarded blocks. The smallest is first, so that larger ones
     # use what it computed: what a guarded block computes is not there outside of it.
-    conditions = _find_taken(lowering, which, len(branches))
+    conditions = _find_taken_branches(lowering, which, len(branches))
     sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
     results: dict[int, list[np.ndarray]] = {}
     for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
@@ -83,7 +83,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     return chosen
 
 
-def _find_taken(lowering: Lowering, which: Node, count: int) -> list[Node]:
+def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[Node]:
     """Return for each branch whether it is taken; indices out of range select the first or last.
 
     `which` is the index, or a flag, by itself or as an integer, that chooses among two.
@@ -94,9 +94,11 @@ def _find_taken(lowering: Lowering, which: Node, count: int) -> list[Node]:
     if which.type == "bool":
         return [graph.node("not", "bool", which), which]
     # Branch k is taken if the index is at most k, but not at most k - 1.
-    at_most = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
-    between = [graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(at_most)]
-    return [at_most[0], *between, graph.node("not", "bool", at_most[-1])]
+    limit_new_nodes = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [
+        graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(limit_new_nodes)
+    ]
+    return [limit_new_nodes[0], *between, graph.node("not", "bool", limit_new_nodes[-1])]
 
 
 def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
@@ -113,13 +115,17 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
         return results
     guard = Guard(block, condition)
     outer.items.append(guard)
-    return [arrange_nodes([_guard_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results]
+    return [
+        arrange_nodes([_read_guarded_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results
+    ]
 
 
-def _guard_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+def _read_guarded_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
     """Return a number of a guarded block as seen from outside of it: zero where the block is skipped."""
     if isinstance(value, RandomKey):
-        return RandomKey(_guard_result(lowering, guard, value.first), _guard_result(lowering, guard, value.second))
+        return RandomKey(
+            _read_guarded_result(lowering, guard, value.first), _read_guarded_result(lowering, guard, value.second)
+        )
     if value.block is not guard.body:
         return value
     if value in guard.values:

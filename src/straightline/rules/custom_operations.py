@@ -148,7 +148,7 @@ def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
     """
     program: _OperationProgram = equation.params["program"]
     try:
-        with lowering.graph.at_most(MANY_TERMS):
+        with lowering.graph.limit_new_nodes(MANY_TERMS):
             return lowering.inline_program(_trace_in_loops(lowering, equation, program.native), inputs)
     except Unsupported:
         return lowering.inline_program(_trace_in_loops(lowering, equation, jaxpr_as_fun(program.plain)), inputs)

@@ -16,7 +16,7 @@ from straightline.rules.index_bounds import (
     fills_outside,
     find_window_places,
     is_inside,
-    make_filling,
+    make_fill_value,
 )
 from straightline.rules.loops import put_in_memory
 from straightline.rules.shapes import select_array
@@ -30,7 +30,7 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     if not fills_outside(equation):
         return [_gather_clipped(equation, lowering, x, indices)]
     indices = convert_to_32_bits(lowering, indices)
-    flags, missing = _is_inside(lowering, equation, x.shape, indices), make_filling(lowering, equation)
+    flags, missing = _is_inside(lowering, equation, x.shape, indices), make_fill_value(lowering, equation)
     gathered, numbers = _gather_clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
     for entry in np.ndindex(*gathered.shape):
         gathered[entry] = select(lowering.graph, flags[_find_index_row(entry, numbers)], gathered[entry], missing)

@@ -48,7 +48,7 @@ def convert_to_32_bits(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
     return arrange_nodes(nodes, indices.shape)
 
 
-def make_filling(lowering: Lowering, equation: JaxprEqn) -> Node:
+def make_fill_value(lowering: Lowering, equation: JaxprEqn) -> Node:
     """Return the node of the value that a gather has in place of what is outside of the array."""
     aval: Any = equation.outvars[0].aval
     if jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key):

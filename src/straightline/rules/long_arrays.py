@@ -28,7 +28,7 @@ from straightline.rules.elementwise import ELEMENTWISE
 from straightline.rules.loops import Turn, put_in_memory, repeat_turns
 from straightline.rules.matrices import combine_nodes, write_product
 from straightline.size_limits import LOADED, MANY_TERMS, TABLE, WRITTEN_OUT
-from straightline.strided_arrays import InMemory
+from straightline.strided_arrays import StridedArray
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -43,7 +43,7 @@ def is_long(inputs: list[Value]) -> bool:
     constants and the other arguments are as many nodes, or what is left to compute is known or, as in q I, of few
     entries. Zeros stay structure then.
     """
-    views = [x for x in inputs if isinstance(x, InMemory)]
+    views = [x for x in inputs if isinstance(x, StridedArray)]
     longest = max((x.size for x in views), default=0)
     if not TABLE < longest <= LOADED:
         return longest > TABLE
@@ -52,7 +52,7 @@ def is_long(inputs: list[Value]) -> bool:
 
 def _is_table(x: Value) -> bool:
     """Return whether an array is a table of constants, at a place that is known."""
-    return isinstance(x, InMemory) and x.buffer.kind == "table" and not x.moves
+    return isinstance(x, StridedArray) and x.buffer.kind == "table" and not x.moves
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
@@ -61,8 +61,8 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
     So it is where one of these is as many nodes already, where all are known, or where there are but single numbers
     beside tables of few entries that are not zero.
     """
-    arrays = [x for x in inputs if not isinstance(x, InMemory)]
-    tables = [x for x in inputs if isinstance(x, InMemory)]
+    arrays = [x for x in inputs if not isinstance(x, StridedArray)]
+    tables = [x for x in inputs if isinstance(x, StridedArray)]
     are_known = all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
     are_single = all(x.size == 1 for x in arrays)
     are_sparse = all(np.count_nonzero(x.get_known_numbers()) <= TABLE for x in tables)
@@ -103,7 +103,7 @@ def take_row(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
     """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
     if x.ndim < ndim:
         return x
-    if isinstance(x, InMemory):
+    if isinstance(x, StridedArray):
         return x.row(0 if x.shape[0] == 1 else row)
     return x[:1].reshape(x.shape[1:])
 
@@ -128,13 +128,13 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     if to_number or not is_long(inputs):
         return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
     arrays = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
-    if (factors := _find_few_terms(equation, arrays)) is not None:
+    if (factors := _find_sparse_product(equation, arrays)) is not None:
         return list(_write_out_product(lowering, equation, factors))
     a, b = (put_in_memory(lowering, x) for x in inputs)
     return _multiply_by_row(lowering, equation, a, b)
 
 
-def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: InMemory, b: InMemory) -> list[Value]:
+def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b: StridedArray) -> list[Value]:
     """Lower a product of arrays in memory as a loop.
 
     As JAX calls them, batch axes are those of both arguments and of the result, contracted ones are summed over, and
@@ -170,7 +170,7 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: InMemory, b: InM
     return list(stacked)
 
 
-def _find_free_axis(x: InMemory, contracted: Sequence[int]) -> int | None:
+def _find_free_axis(x: StridedArray, contracted: Sequence[int]) -> int | None:
     """Return the first axis that is not summed over; None if all are."""
     return next((d for d in range(x.ndim) if d not in contracted), None)
 
@@ -188,10 +188,10 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
     if a.size * b.size <= MANY_TERMS * a.shape[left]:  # few enough with all zeros: no need to count them
         return 0
     # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
-    return int(_count_data(a, left) @ _count_data(b, right))
+    return int(_count_nonzero_entries(a, left) @ _count_nonzero_entries(b, right))
 
 
-def _count_data(x: np.ndarray, axis: int) -> np.ndarray:
+def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
     """Count the entries that are no known zero, for each place along an axis."""
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
@@ -213,7 +213,7 @@ def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: 
     return list(total)
 
 
-def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
+def _find_sparse_product(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the factors of a product by a known matrix as (free, contracted) if its zeros leave few terms, else None.
 
     A known factor is an array of numbers, the other one of nodes.
@@ -221,14 +221,14 @@ def _find_few_terms(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray
     dimensions, (batch, _) = equation.params["dimension_numbers"]
     tables = [_is_table(x) for x in inputs]
     arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
-    if batch or not any(tables) or any(isinstance(x, InMemory) for x in arrays):
+    if batch or not any(tables) or any(isinstance(x, StridedArray) for x in arrays):
         return None
     # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.
     factors, terms = [], np.ones(1, dtype=np.int64)
     for x, is_table, contracted in zip(arrays, tables, dimensions, strict=True):
         free = [d for d in range(x.ndim) if d not in contracted]
         rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
-        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_data(rows, 1))
+        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_nonzero_entries(rows, 1))
         factors.append(rows)
     return (factors[0], factors[1]) if terms.sum() <= WRITTEN_OUT else None
 
@@ -241,7 +241,7 @@ def _write_out_product(
     `factors`: A and B as (rows, contracted axis); k ascends.
     """
     graph, type = lowering.graph, result_type(equation)
-    left, right = ([_find_data(graph, type, row) for row in factor] for factor in factors)
+    left, right = ([_find_nonzero_entries(graph, type, row) for row in factor] for factor in factors)
     entries = []
     for a in left:
         for b in right:
@@ -250,14 +250,14 @@ def _write_out_product(
     return [arrange_nodes(entries, result_shape(equation))]
 
 
-def _find_data(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
+def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
     """Return the entries of a row that are no known zeros, by their places."""
     if row.dtype != object:
         return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
     return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
 
 
-def _move_to_front(x: InMemory, axis: int) -> InMemory:
+def _move_to_front(x: StridedArray, axis: int) -> StridedArray:
     """Return a view with this axis first."""
     order = [axis, *(a for a in range(x.ndim) if a != axis)]
     return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])

@@ -39,7 +39,7 @@ class ContinuedFraction(NamedTuple):
     change: jax.Array
 
 
-def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P, each to its digits.
 
     With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is a series, above it Q is a continued fraction
@@ -59,7 +59,7 @@ def gamma_masses(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     # The smaller mass as computed, to all its digits; the other one is 1 minus it.
     p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
     q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
-    expanded_p, expanded_q = gamma_masses_of_large_shape(a, x)
+    expanded_p, expanded_q = regularised_incomplete_gammas_of_large_shape(a, x)
     use_expansion = is_large & (x < jnp.inf)
     p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
     p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
@@ -101,8 +101,8 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
         """Add the next level: partial numerator n (a - n) over x + 2 n + 1 - a."""
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
-        c, d = b + numerator / c, 1 / _keep_from_zero(b + numerator * d)
-        return ContinuedFraction(n + 1, _keep_from_zero(c), d, fraction * c * d, jnp.abs(c * d - 1))
+        c, d = b + numerator / c, 1 / _replace_zero_by_tiny(b + numerator * d)
+        return ContinuedFraction(n + 1, _replace_zero_by_tiny(c), d, fraction * c * d, jnp.abs(c * d - 1))
 
     def still_changes(state: ContinuedFraction) -> jax.Array:
         """Return whether the last level changed the value; a fraction that does not serve ends at once."""
@@ -115,7 +115,7 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
     return jax.lax.while_loop(still_changes, continue_fraction, start).value
 
 
-def gamma_masses_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def regularised_incomplete_gammas_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute P(a, x) and Q(a, x), the masses of the gamma law of a large shape a below and above x, by expansion.
 
     A series in powers of x would take many terms.
@@ -169,7 +169,7 @@ def expand_coefficients() -> list[list[float]]:
     return [[float(c) for c in one[:TERMS]] for one in series]
 
 
-def _keep_from_zero(x: jax.Array) -> jax.Array:
+def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
     """Return x, a tiny number for zero."""
     return jnp.where(x == 0, TINY, x)
 
@@ -234,7 +234,7 @@ def digamma(x: jax.Array) -> jax.Array:
 
 def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Return P(a, x) of `igamma`, or Q(a, x) of `igammac`."""
-    below, above = _inline_in_double(gamma_masses, lowering, equation, inputs)
+    below, above = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
     return [above if equation.primitive.name == "igammac" else below]
 
 
@@ -245,7 +245,7 @@ def _inline_in_double(
     avals: list[Any] = [v.aval for v in equation.invars]
     if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
-    program = _trace_over(function, len(avals), avals[0].shape)
+    program = _trace_over_arrays(function, len(avals), avals[0].shape)
     results = lowering.inline_program(program, [_convert(lowering, "f64", x) for x in inputs])
     return [_convert(lowering, type_of(avals[0]), x) for x in results]
 
@@ -257,7 +257,7 @@ def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
 
 
 @cache
-def _trace_over(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
     """Return the program of a function of `count` scalars over arrays of a shape."""
     over_arrays = function
     for _ in shape:

@@ -49,7 +49,7 @@ SCALAR = {
 }
 
 
-def write_functions(names: Iterable[str], width: int) -> str:
+def write_elementary_functions(names: Iterable[str], width: int) -> str:
     """Return the text of `define internal %double @hg_NAME(%double ...)` for each name, with declarations.
 
     A name that ends in f is that of a function of floats, as in C.

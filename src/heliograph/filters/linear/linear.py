@@ -40,7 +40,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
-from heliograph.random_affine.memories_of_channels import is_modal
+from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outlier_noise import has_bounded_noise
 from heliograph.random_affine.words.rounding_noise import find_rounded
@@ -222,7 +222,7 @@ def linear_filter(
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
     # Memory: the modes are estimated jointly with the state. A sensor that rounds may lower the claim.
-    if first(channel).remembers or is_modal(first(plant)) or is_modal(first(sensor)):
+    if first(channel).remembers or is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if has_bounded_noise(plant, sensor, channel):
@@ -250,7 +250,7 @@ def linear_filter(
 
 def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
     """Return the filter that estimates the modes of links, plant and sensor jointly with the state."""
-    if is_modal(first(plant)) or is_modal(first(sensor)):
+    if is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         return _make_jump_system_filter(plant, sensor, channel)
     if first(channel).erases:
         return modes.side_information_filter(plant, sensor, channel)

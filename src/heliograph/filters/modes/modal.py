@@ -42,7 +42,7 @@ from heliograph.filters.modes.linear_by_mode import (
 )
 from heliograph.filters.modes.models_by_mode import find_models
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.linear.jump_system import mix_modes, propagate_by_mode
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import models_of
@@ -178,7 +178,7 @@ class ModalFilter(AbstractJointModalFilter):
         Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
         """
         rows = self._transition_matrix(state, k)
-        arriving, motion = mix_modes(rows, state.moments), self._motion(state, u, k)
+        arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
         law = arriving[:, -1, -1]
         # F zeta about the moving centre.
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
@@ -220,7 +220,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
         """Return how the state moves about its centre in each mode of the step."""
-        arriving = mix_modes(self._transition_matrix(state, k), state.moments)
+        arriving = mix_moments_of_modes(self._transition_matrix(state, k), state.moments)
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:

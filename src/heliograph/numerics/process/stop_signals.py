@@ -24,7 +24,7 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
 
     def handle_or_wait(number: int, frame: FrameType | None) -> None:
         """Pass a signal to the handler, or raise it again soon while a module in C is imported."""
-        if _imports_in_c(frame):
+        if _is_loading_c_module(frame):
             timer = Timer(SOON, interrupt_main, (number,))
             timer.daemon = True
             timer.start()
@@ -42,7 +42,7 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
             signal.signal(number, former)
 
 
-def _imports_in_c(frame: FrameType | None) -> bool:
+def _is_loading_c_module(frame: FrameType | None) -> bool:
     """Return whether a module in C is being loaded, which an exception would leave half initialised."""
     while frame is not None:
         if frame.f_code.co_filename == IMPORTS and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):

@@ -43,7 +43,7 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
     """
-    return channel.moments(order).expect(_check_moments(channel, order, moments))
+    return channel.moments(order).expect(_return_checked_moments(channel, order, moments))
 
 
 @push_moments.register
@@ -52,7 +52,9 @@ def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Arr
 
     E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
     """
-    known = push_through_known_map(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
+    known = push_through_known_map(
+        affine_matrix(channel.matrix), order, _return_checked_moments(channel, order, moments)
+    )
     scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = plan_binomial_sums(channel.outputs, order)
     terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
@@ -86,7 +88,7 @@ def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> 
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     second = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
-    propagated = second.reshape(-1)[_choose_places(outputs, order // 2)]
+    propagated = second.reshape(-1)[_choose_product_places(outputs, order // 2)]
     return propagated
 
 
@@ -113,7 +115,7 @@ class TabulatedNoise(AbstractNoise):
 
 
 @noise_vector.register
-def _look_moments_up(noise: TabulatedNoise, order: int) -> Array1:
+def _read_tabulated_moments(noise: TabulatedNoise, order: int) -> Array1:
     """Return all moments up to `order` of a noise, out of its table."""
     return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
@@ -133,7 +135,7 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
     return moments[product_table(variables, degree, degree)]
 
 
-def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+def _return_checked_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     """Return the moments; raise unless they are those of the channel's inputs up to the order."""
     check_forgets("channel of a lift", channel)
     expected = count_monomials(channel.inputs + 1, order)
@@ -143,7 +145,7 @@ def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -
 
 
 @cache_arrays
-def _choose_places(variables: int, degree: int) -> np.ndarray:
+def _choose_product_places(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)
     places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)

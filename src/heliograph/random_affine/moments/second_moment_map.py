@@ -31,7 +31,7 @@ class QuadraticMap(Module):
         mask = present[:, None] & present[None, :]
         center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        unit = jnp.sqrt(_or_one(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
+        unit = jnp.sqrt(_one_unless_positive(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
         return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
 
     def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
@@ -39,7 +39,7 @@ class QuadraticMap(Module):
         return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
-def _or_one(value: jax.Array) -> jax.Array:
+def _one_unless_positive(value: jax.Array) -> jax.Array:
     """Return positive numbers as they are, and 1 in place of others: a divisor."""
     return jnp.where(value > 0, value, 1.0)
 

@@ -287,9 +287,9 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_spreads(spreads)
     # Spreads of a sum add up, and that of its noise.
-    whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
+    whole, size = channel.sum_in_places(dict(enumerate(means)), 1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _constant_power(size)
-    spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise
+    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), 2) + noise
     return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
@@ -330,7 +330,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     """
     # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
     every = range(len(parts))  # numbers of the parts
-    mean = channel.in_places({i: parts[i].mean for i in every}, 1)
+    mean = channel.sum_in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
@@ -365,8 +365,8 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
     """Return the weighted sum of the maps of parts, each at the places of what its part takes."""
     parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
-    center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
-    return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
+    center = channel.sum_in_places({i: part.center for i, part in parts.items()}, 2)
+    return QuadraticMap(center, channel.sum_in_places({i: part.radius for i, part in parts.items()}, 2))
 
 
 def _constant_power(size: int) -> np.ndarray:

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.moment_tensors import (
     Matrix,
@@ -33,47 +34,58 @@ def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
     """
     xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    exact, holds = _find_common_gain(tensors, mean)
+    exact, holds = _find_dominating_tensor(tensors, mean)
     return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
 
 
-def _find_common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
-    """Return max_v s_v M y y' M' + N_max, N_max the largest noise, and whether it dominates the tensors of all laws v.
+def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+    """Return the tensor max_v s_v M y y' M' + N_max, and whether it dominates the tensors of all laws v.
 
-    It does if the gain's part of the tensor of law v is s_v M y y' M', to rounding, gain and noise are uncorrelated,
-    and N_max - N_v >= 0.
+    N_max is the largest noise. It dominates if the gain's part of the tensor of law v is s_v M y y' M', to rounding,
+    gain and noise are uncorrelated, and N_max - N_v >= 0.
 
     Args:
         tensors: (law, m, m, p + 1, p + 1), maps of (y, 1) (y, 1)' to a second moment of z.
         mean: (M, mean offset) (m, p + 1).
     """
     xp = library(tensors, mean)
-    shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M'
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M' (m, m, p, p)
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
     mean_size: Matrix = xp.abs(mean[:, :-1])
-    # Sizes of the entries of gains and of gain times noise, for relative tolerances.
+    # Sizes for relative tolerances: of the gains' entries (m, m, p, p), of each noise (m,), and of the product of entry
+    # (i, a) of a gain and noise j, at (i, j, a).
     gain_size = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
     noise_size = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
     cross_size = xp.sqrt(xp.einsum("iiaa->ia", gain_size))[:, None, :] * noise_size[:, None]
-    # Least squares for s_v in gains_v = s_v M y y' M'.
-    size = xp.sum(shape**2)
-    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
-    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
-    # N_max, that of the largest trace. N_max - N_v >= 0 is judged in units in which N_max has ones on its diagonal, so
-    # that the tolerance is relative.
-    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
-    unit = xp.sqrt(xp.diagonal(largest))
-    unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
-    gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    multiples, residual = _fit_multiples(gains, shape)
+    largest, noise_is_largest = _find_largest_noise(noises)
     gains_are_multiples = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
     is_uncorrelated = xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
-    noise_is_largest = xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE
     # max_v s_v M y y' M' + N_max, the latter as what multiplies the constant 1.
     constant = np.zeros((mean.shape[1], mean.shape[1]))
     constant[-1, -1] = 1.0
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
     dominating = widened + largest[:, :, None, None] * constant
     return dominating, gains_are_multiples & is_uncorrelated & noise_is_largest
+
+
+def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
+    """Return the s_v (law,) of least squares in gains_v = s_v `shape`, and how far each entry is off it."""
+    xp = library(gains, shape)
+    size = xp.sum(shape**2)
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
+    return multiples, xp.abs(gains - multiples[:, None, None, None, None] * shape)
+
+
+def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
+    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether all N_max - N_v >= 0."""
+    xp = library(noises)
+    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
+    # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    return largest, xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE
 
 
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:

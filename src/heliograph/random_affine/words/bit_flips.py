@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.numerics.check import check_count, fail, flag, items, scalar, show_value
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.composite import percent_in_words
+from heliograph.random_affine.composite import write_percentage
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import JointMoments
@@ -85,7 +85,7 @@ class Flips(AbstractRandomAffine):
 
     def in_words(self) -> str:
         """Return how many of the bits flip."""
-        return f"words, {percent_in_words(self.error.moment(1))} of bits flipped"
+        return f"words, {write_percentage(self.error.moment(1))} of bits flipped"
 
 
 class BitFlips(AbstractRandomAffine):

@@ -19,7 +19,7 @@ from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.channel_state_information import told_maps
+from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
@@ -195,7 +195,7 @@ def _find_reservations(network: Network) -> Iterator[Doubt]:
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
             continue
-        for affine in told_maps(first(node.channel)):
+        for affine in list_told_maps(first(node.channel)):
             if why := affine.reservation:
                 what = join_names([repr(number) for number in affine.names])
                 yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import choose_code, map_arrays, read_setting
+from heliograph.engine.choice import choose_code, map_arrays, read_forced_engine
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.network_fusion import Fusion
@@ -241,14 +241,14 @@ class RowSmoother:
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length, which an engine is chosen for once."""
-        key = len(history.rows), read_setting()
+        key = len(history.rows), read_forced_engine()
         if key not in self._programs:
             span = np.zeros(2, dtype=np.int32)
             choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
             if choice.code is None:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:
-                code = choice.code.with_first(*self._numbers)
+                code = choice.code.with_first_arguments(*self._numbers)
                 self._programs[key] = lambda *arguments: _take_only_run(code(*jax.tree.leaves(arguments)))
         return self._programs[key]
 

@@ -133,7 +133,7 @@ class RowStep:
         row = np.zeros((1, self._layout.size))
         self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
-        self._code = None if code is None else code.with_first(*self._numbers)
+        self._code = None if code is None else code.with_first_arguments(*self._numbers)
 
     @property
     def engine(self) -> str:
@@ -195,7 +195,7 @@ class RowStep:
 
     def for_one(self) -> "OneRowStep":
         """Return the step of one row at a time, which has memory of its own."""
-        return OneRowStep(self, None if self._code is None else self._code.for_runs(1))
+        return OneRowStep(self, None if self._code is None else self._code.make_in_place_code(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Return the states and outputs after each row's step.

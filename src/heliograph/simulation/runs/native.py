@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import try_native
+from heliograph.engine.choice import make_native_or_none
 from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.types import PyTree
@@ -312,7 +312,9 @@ def simulate_natively(
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
     if can_be_split and type(reducer).joined is not AbstractReducer.joined:
         return _simulate_in_parts(network, inputs, key, reducer, (first_run, runs, chunk), progress, precision)
-    code = try_native(lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision))
+    code = make_native_or_none(
+        lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision)
+    )
     if code is None:
         return None
     check_memory_of_parts(code, 1, runs, len(inputs), precision)
@@ -338,7 +340,7 @@ def _simulate_in_parts(
     results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
     for number, (some, world) in enumerate(split_nodes(network)):
         make = partial(compile_runs, world, inputs, key, reducer, runs, precision=precision)
-        code = try_native(make)
+        code = make_native_or_none(make)
         if code is None:
             return None
         if number == 0:

@@ -68,7 +68,7 @@ class NativeLanes:
         """Return the sums over all runs, by batch, and give their memory back; nothing that is collected."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
-        totals = iter(code.add_parts(used))
+        totals = iter(code.add_partial_sums(used))
         self.memory += used
         leaves, common = [], []
         # Results that all runs share stand as of one run.
