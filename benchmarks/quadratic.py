@@ -19,7 +19,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.factors.square_root_update import covariance_of_root, roots_of
-from heliograph.linear.lmmse_recursion import RecursionStep, step_covariance_roots, take_noise_roots
+from heliograph.linear.lmmse_recursion import RecursionStep, find_noise_roots, step_covariance_roots
 from heliograph.linear.system import Steps
 from heliograph.random_affine.moments.monomials import position
 
@@ -72,7 +72,7 @@ def seconds(call: Callable[[], object], dimension: int) -> float:
 
 def prepared(step: Steps, covariance: np.ndarray) -> Callable[[], RecursionStep]:
     """The covariance step of this model, whose roots are taken before the clock starts."""
-    return partial(step_covariance_roots, roots_of(covariance), step, take_noise_roots(step, np.diag(covariance)))
+    return partial(step_covariance_roots, roots_of(covariance), step, find_noise_roots(step, np.diag(covariance)))
 
 
 class Row(NamedTuple):

@@ -81,7 +81,7 @@ class CLowering(Lowering):
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         array = np.asarray(number)
-        return StridedArray.whole(Buffer("table", type_of(array), array.shape, self.graph.top, array))
+        return StridedArray.of_whole_buffer(Buffer("table", type_of(array), array.shape, self.graph.top, array))
 
 
 def lower_for_c(
@@ -105,7 +105,7 @@ def lower_for_c(
         buffers.append(buffer)
         if number in finite:
             graph.finite_buffers.add(buffer)
-        value: Any = StridedArray.whole(buffer)
+        value: Any = StridedArray.of_whole_buffer(buffer)
         if number in symmetric:  # entries (i, j) and (j, i) are one node, that of the upper triangle
             nodes, n = value.nodes(graph), aval.shape[0]
             value = arrange_nodes([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)

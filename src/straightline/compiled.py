@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
 from straightline.constant_folding import DTYPES
 from straightline.llvm.module_text import ModuleText, write_module
-from straightline.machine_code import Machine, TieredCode, choose_hasty_width, find_processor_features, generate
+from straightline.machine_code import MachineCode, TieredCode, choose_hasty_width, emit_code, find_processor_features
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
 from straightline.result_memory import make_aligned_array
@@ -72,15 +72,15 @@ class CompiledFunction:
         """
         return InPlaceCode(self, runs, inputs)
 
-    def prepare(self, arrays: Sequence[Any] = ()) -> str:
+    def generate_code(self, arrays: Sequence[Any] = ()) -> str:
         """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
         if self._refusal is None:
             try:
                 if self.once is not None:
-                    self.once.prepare(1)
+                    self.once.generate_code(1)
                 if not all(self.code.common):
                     tiers, width = self._choose_code_and_width(self._count_runs(arrays))
-                    tiers.prepare(-(-self._count_runs(arrays) // width))
+                    tiers.generate_code(-(-self._count_runs(arrays) // width))
                 self._refusal = ""
             except Unsupported as error:
                 self._refusal = str(error)
@@ -190,7 +190,7 @@ class MemoryOfCall(NamedTuple):
     Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
     """
 
-    machine: Machine
+    machine: MachineCode
     pointers: np.ndarray
     memory: Any
     runs: int
@@ -275,11 +275,11 @@ class SingleRunCode:
         every, (_name, _flags, fuses) = [True] * len(program.inputs), find_processor_features()
         self.code = write_module(program, differing=every, width=1, fuse=fuses, alone=True, last=in_place)
         level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long
-        self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
+        self.machine, self.tree, self._in_place = emit_code(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._allocate_memory([])
 
-    def again(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
+    def with_new_memory(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
         """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
         new._allocate_memory(first)

@@ -1,4 +1,4 @@
-"""Simplification of scalar operations: constants, neutral elements, two operations as one.
+"""Simplification of scalar operations as they are made: constants are computed, x + 0 is x, -(-x) is x.
 
 A product with zero is zero only if the other factor is known to be finite: data may be NaN. In a product of matrices a
 known zero leaves its term out (`rules/matrices.py`).

@@ -52,9 +52,9 @@ class Lowering:
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
         for equation in _list_used_equations(jaxpr):
-            arguments = [self._look_up(values, v) for v in equation.invars]
+            arguments = [self._look_up_argument(values, v) for v in equation.invars]
             values |= zip(equation.outvars, self.lower_equation(equation, arguments), strict=True)
-        return [self._look_up(values, v) for v in jaxpr.outvars]
+        return [self._look_up_argument(values, v) for v in jaxpr.outvars]
 
     def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
@@ -64,7 +64,7 @@ class Lowering:
 
     def _make_empty_view(self, aval: Any) -> StridedArray:
         """Return an array without entries, in memory of its type and shape."""
-        return StridedArray.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
+        return StridedArray.of_whole_buffer(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Return the results of one operation.
@@ -114,10 +114,10 @@ class Lowering:
         array = np.asarray(number)
         type = type_of(array)
         if array.size > TABLE:
-            return StridedArray.whole(Buffer("table", type, array.shape, self.graph.top, array))
+            return StridedArray.of_whole_buffer(Buffer("table", type, array.shape, self.graph.top, array))
         return arrange_nodes([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
-    def _look_up(self, values: dict[Var, Value], v: Any) -> Value:
+    def _look_up_argument(self, values: dict[Var, Value], v: Any) -> Value:
         """Return the value of an operation's argument: a literal's constant, else what was computed."""
         return self.make_known_array(_convert_literal(v.val, v)) if isinstance(v, Literal) else values[v]
 
@@ -135,7 +135,7 @@ def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
 
 
 @contextmanager
-def refuse_failures(what: str) -> Iterator[None]:
+def turn_failures_into_refusals(what: str) -> Iterator[None]:
     """Turn a failure of what makes native code into a refusal."""
     try:
         yield

@@ -1,4 +1,4 @@
-"""Code of this machine from text of LLVM IR: generated in haste at first, and with care once it is executed often."""
+"""Machine code from text of LLVM IR: generated in haste first, and again with care once it is executed often."""
 
 import ctypes
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import jax
 import llvmlite.binding as llvm
 
 from straightline.llvm.module_text import FunctionSource
-from straightline.lowering import refuse_failures, warn_once
+from straightline.lowering import turn_failures_into_refusals, warn_once
 from straightline.nodes import Unsupported
 from straightline.size_limits import OFTEN
 
@@ -42,8 +42,8 @@ def find_processor_features() -> tuple[str, str, bool]:
     return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
 
 
-class Machine:
-    """Code of one text; its function `run` may be called as long as this object exists.
+class MachineCode:
+    """Machine code of one text of LLVM IR; its function `run` may be called as long as this object exists.
 
     LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
     `level` is that of the generation: 0 in haste, 1 with registers assigned with care; `width` is the count of runs of
@@ -86,8 +86,8 @@ def _get_hasty_thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
-@refuse_failures("a program")
-def generate(source: FunctionSource, level: int, width: int) -> Machine:
+@turn_failures_into_refusals("a program")
+def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
     """Generate code outside of the main thread, and wait for it.
 
     Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
@@ -97,14 +97,14 @@ def generate(source: FunctionSource, level: int, width: int) -> Machine:
         Unsupported: LLVM makes no code of it, which is said once.
     """
     if current_thread() is not main_thread():
-        return Machine(source, level, width)
-    return _get_hasty_thread().submit(Machine, source, level, width).result()
+        return MachineCode(source, level, width)
+    return _get_hasty_thread().submit(MachineCode, source, level, width).result()
 
 
-def _generate_with_care(source: FunctionSource, width: int, hasty: Machine) -> Machine:
+def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) -> MachineCode:
     """Generate code with care; if that fails, that in haste goes on, and it is said once."""
     try:
-        return Machine(source, 1, width)
+        return MachineCode(source, 1, width)
     except Exception as error:
         warn_once(
             f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on"
@@ -123,15 +123,15 @@ class TieredCode:
     def __init__(self, source: FunctionSource, widths: tuple[int, int]):
         """Begin without code; `widths`: runs of a vector of code in haste, and of code made with care."""
         self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
-        self._machine: Machine | None = None
-        self._careful: Future[Machine] | None = None
+        self._machine: MachineCode | None = None
+        self._careful: Future[MachineCode] | None = None
 
-    def prepare(self, blocks: float) -> None:
+    def generate_code(self, blocks: float) -> None:
         """Generate code for a first execution for so many blocks, if there is none."""
         with self._lock:
             self._make_first(self._executions + self._count_executions(blocks))
 
-    def choose_machine(self, blocks: float) -> Machine:
+    def choose_machine(self, blocks: float) -> MachineCode:
         """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
         made = self._machine
         if made is not None and made.level:  # nothing better is to come
@@ -150,11 +150,11 @@ class TieredCode:
                     self._machine = machine = self._careful.result()
             return machine
 
-    def _make_first(self, executions: float) -> Machine:
+    def _make_first(self, executions: float) -> MachineCode:
         """Return the code that is made at the first call, at a level for so many executions."""
         if self._machine is None:
             level = self._choose_level(executions)
-            self._machine = generate(self._source, level, self._widths[level])
+            self._machine = emit_code(self._source, level, self._widths[level])
         return self._machine
 
     def _count_executions(self, blocks: float) -> float:

@@ -1,4 +1,4 @@
-"""Numbers of a loop that come back, bit for bit: computed once, and kept for the turns in which they do.
+"""Values of a loop that repeat bit for bit with a period: computed once, then read from a ring of stored rows.
 
 The covariance of a Kalman filter converges until it stands still, or goes round among a few roundings, and with it
 gains, variances and logarithms; from then on means are all that a turn has to compute, a tenth of it. Of a loop's body
@@ -30,7 +30,7 @@ INTEGERS: dict[Type, Type] = {"f64": "i64", "f32": "i32"}  # that have the bits 
 
 
 class RecurringNodes(NamedTuple):
-    """What of a loop's body may come back.
+    """Numbers of a loop's body whose values may repeat from turn to turn: S and C of this file's beginning.
 
     nodes: S, in order; carried: C, by number; tests: of a turn's rows, of which S needs the outcome; rows: what these
     are computed of, in order, and they themselves.
@@ -43,7 +43,7 @@ class RecurringNodes(NamedTuple):
 
 
 def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
-    """Rewrite each counted loop of one run where much comes back; return what the outputs need then.
+    """Rewrite each counted loop of one run in which many values may repeat; return what the outputs need then.
 
     Much: S has more than DEAR operations beside the numbers that others need of it.
     """
@@ -86,7 +86,7 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | Non
         carried = still_carried
     if not carried or len(computed) <= DEAR:
         return None
-    _leave_fused_products(needed, computed)
+    _leave_fused_products_in_turn(needed, computed)
     # Only the tests that S or C's next values use; what these are computed of is no part of S, even where it follows
     # from other tests, since the tests are computed in each turn.
     used = {a for n in computed for a in n.args} | {loop.following[k] for k in carried}
@@ -123,7 +123,7 @@ def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, Non
     return {n: None for n in rows if n in wanted}
 
 
-def _leave_fused_products(needed: Iterable[Any], found: dict[Node, None]) -> None:
+def _leave_fused_products_in_turn(needed: Iterable[Any], found: dict[Node, None]) -> None:
     """Remove from `found` the products that are fused with a sum outside of it: apart from the sum they are rounded."""
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for x in needed:
@@ -193,7 +193,7 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
     last_row, period = _carry_integer(graph, loop, RING - 1), _carry_integer(graph, loop, 0)
     turn = _choose_ring_row(graph, found.tests, test_ring, last_row, period)
     # S, the stores of its row, and whether it closes a cycle.
-    closes = _guard_nodes(graph, loop, found, kept, turn, (test_ring, value_ring))
+    closes = _move_to_guarded_block(graph, loop, found, kept, turn, (test_ring, value_ring))
     # A cycle that closes with row p - 1 has the period p.
     zero, one = graph.constant(0, "i64"), graph.constant(1, "i64")
     found_period = select(graph, closes, graph.node("add", "i64", turn.now, one), zero)
@@ -207,7 +207,7 @@ def _rewrite_loop(graph: Graph, items: Iterable[Any], loop: Loop, found: Recurri
     graph.current = enclosing
 
 
-def _guard_nodes(
+def _move_to_guarded_block(
     graph: Graph,
     loop: Loop,
     found: RecurringNodes,
@@ -228,7 +228,7 @@ def _guard_nodes(
         ring.store(nodes, turn.now)
     guard.values = [_compare_with_start(graph, loop, found.carried, turn.begins)]
     graph.current = loop.body
-    guard.results = [graph.fresh("guarded", "bool", (), loop.body, (guard, 0))]
+    guard.results = [graph.make_fresh_node("guarded", "bool", (), loop.body, (guard, 0))]
     loop.body.items.append(guard)
     return guard.results[0]
 
@@ -277,8 +277,8 @@ def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
     """Make an integer that the loop carries, `start` before the first turn; return its parameter."""
     place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
-    loop.parameters.append(graph.fresh("parameter", "i64", (), loop.body, place))
-    loop.results.append(graph.fresh("result", "i64", (), loop.block, place))
+    loop.parameters.append(graph.make_fresh_node("parameter", "i64", (), loop.body, place))
+    loop.results.append(graph.make_fresh_node("result", "i64", (), loop.block, place))
     return loop.parameters[-1]
 
 

@@ -94,7 +94,7 @@ def lower_traced(
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
         shape = (*aval.shape, 2) if is_key else aval.shape  # a key is two words
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
-        view = StridedArray.whole(buffer)
+        view = StridedArray.of_whole_buffer(buffer)
         inputs.append(buffer)
         if number in known:
             mask, numbers = known[number]
@@ -214,11 +214,11 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
     return []
 
 
-def sort_items(items: Iterable[Any]) -> list[Any]:
+def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
     """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
 
     def position(x: Any) -> int:
-        """Return the serial of the number after which an item stands, -1 for the beginning."""
+        """Return the serial of the number after which an item stands; -1, the beginning, if it depends on none."""
         if isinstance(x, Store):
             return x.node.serial
         if isinstance(x, Loop | Guard):
@@ -228,7 +228,7 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
     return sorted(items, key=position)
 
 
-def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
+def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
     The input buffers are among them. What differs is spread step by step, from each item to those that are computed
@@ -272,13 +272,13 @@ def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]
     What runs share is computed once, before them. Of an array that a loop carries in memory the numbers of the last
     turn are left then: where runs need those of every turn, each has an array of its own.
     """
-    differing = find_varying(items, inputs)
+    differing = find_varying_items(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
     # Carried memory that runs read within the loop joins what differs, and what follows from it, until none is left.
     while read_in_turns := (
         carried and _find_memory_read_in_parts(find_crossing_items(items, differing)) & carried - differing
     ):
-        differing = find_varying(items, [*inputs, *read_in_turns, *(carried & differing)])
+        differing = find_varying_items(items, [*inputs, *read_in_turns, *(carried & differing)])
     return differing
 
 

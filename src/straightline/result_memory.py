@@ -22,7 +22,7 @@ _kept: dict[int, np.ndarray] = {}  # by identity, oldest first; a single operati
 
 
 class _LoanedBytes:
-    """Bytes below an array: NumPy holds this object for the array and its views, and drops it with the last of them."""
+    """Kept bytes lent to an array: NumPy holds this object for it and its views, and drops it with the last one."""
 
     def __init__(self, memory: np.ndarray):
         self._memory = memory

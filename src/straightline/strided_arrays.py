@@ -1,4 +1,4 @@
-"""Arrays in memory: a view of a buffer with strides, as NumPy's, whose numbers are loaded when they are used."""
+"""Arrays in memory as views of a buffer with strides, as NumPy's; numbers are loaded when they are used."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class StridedArray:
         )
 
     @classmethod
-    def whole(cls, buffer: Buffer) -> "StridedArray":
+    def of_whole_buffer(cls, buffer: Buffer) -> "StridedArray":
         """Return the view of a whole buffer."""
         return cls(buffer, buffer.shape, contiguous_strides(buffer.shape))
 

@@ -20,7 +20,7 @@ PARTS = 64  # sums of their own, which computers of any number of cores share ou
 
 
 class SummingProgram:
-    """Code of a program with one argument that differs between runs, the number of the run.
+    """Compiled program of a run's number and of arguments that all runs share: some results are summed over runs.
 
     `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
     """
@@ -53,7 +53,7 @@ class SummingProgram:
                 collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
         return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
 
-    def begin(self, arguments: Sequence[Any], runs: int) -> "SummingProgramWithArguments":
+    def bind_arguments(self, arguments: Sequence[Any], runs: int) -> "SummingProgramWithArguments":
         """Return the program with its arguments (all but the run's number), and what all runs share, computed.
 
         The code is made for as many runs as will follow.
@@ -72,19 +72,19 @@ class SummingProgram:
             first: number of the first one; 0 by default.
         """
         # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
-        begun = self.begin(jax.tree.leaves(arguments), runs)
+        begun = self.bind_arguments(jax.tree.leaves(arguments), runs)
         part_length = -(-runs // (PARTS * self.width)) * self.width
         starts = range(first, first + runs, part_length)
         sums = [begun.make_zero_sums() for _ in starts]
 
         def compute_part(part: int) -> list[np.ndarray | None]:
             """Add the runs of a part to its sums; return its results that are collected, None for all others."""
-            return begun.add(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
+            return begun.add_runs(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
 
         collected = list(get_thread_pool().map(compute_part, range(len(starts))))
-        return jax.tree.unflatten(self.tree, self._join_parts(begun, sums, collected, first, runs))
+        return jax.tree.unflatten(self.tree, self._join_results_of_parts(begun, sums, collected, first, runs))
 
-    def _join_parts(
+    def _join_results_of_parts(
         self,
         begun: "SummingProgramWithArguments",
         sums: Sequence[Sequence[np.ndarray]],
@@ -92,7 +92,7 @@ class SummingProgram:
         first: int,
         runs: int,
     ) -> list[Any]:
-        """Return each result, leaf by leaf, of the parts' sums and of what each part collected.
+        """Return each result, leaf by leaf, from the sums of parts of the runs and from what each part collected.
 
         A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
         runs share is repeated for each run, or counts once for each run of a batch.
@@ -113,7 +113,7 @@ class SummingProgram:
 
 
 class SummingProgramWithArguments:
-    """A program with its arguments; `shared` has the results that all runs share, None for all others."""
+    """A summing program whose shared arguments are given; `shared`: results that all runs share, None for others."""
 
     def __init__(self, program: SummingProgram, arguments: Sequence[Any], runs: int):
         """Convert the arguments, compute what all runs share, and make code for about so many runs."""
@@ -151,13 +151,13 @@ class SummingProgramWithArguments:
             x.fill(0.0)
         return taken
 
-    def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
+    def add_runs(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
         """Add the runs of these numbers (run,) to `sums` in place; return what is collected of them.
 
         That is for each result, leaf by leaf, an array (run, ...), or None where it is summed or all runs share it.
         """
         numbers = np.ascontiguousarray(runs, dtype=np.uint32)
-        outputs, collected = self._make_outputs(len(numbers), sums)
+        outputs, collected = self._allocate_outputs(len(numbers), sums)
         # There is no code for runs where they share all results.
         if len(numbers) and self._machine is not None:
             scratch = allocate_aligned(self.program.code.scratch)
@@ -166,7 +166,9 @@ class SummingProgramWithArguments:
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return collected
 
-    def _make_outputs(self, runs: int, sums: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
+    def _allocate_outputs(
+        self, runs: int, sums: Sequence[np.ndarray]
+    ) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
         """Return an array for each output of the code, and the same with None for all that is not collected.
 
         An output is one of `sums`, a new array (run, ...), or, where all runs share the result, an empty one.

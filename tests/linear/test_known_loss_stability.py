@@ -30,7 +30,7 @@ def independent(example, arrival):
 
 
 def bound(system):
-    return system.bound(find_gains(system)).sum(axis=0)
+    return system.solve_steady_covariances(find_gains(system)).sum(axis=0)
 
 
 def lower_bound(system):
@@ -77,7 +77,7 @@ def test_bounds_enclose_the_mean_over_all_patterns():
     """E P_T over all 2^T patterns of losses, started where the bound stands, lies between the bounds at each step."""
     system = lossy(COUPLED, [[0.9, 0.1], [0.7, 0.3]])
     a, c, q, r = (np.asarray(item) for item in COUPLED)
-    upper, lower = system.bound(find_gains(system)), lower_bound(system)
+    upper, lower = system.solve_steady_covariances(find_gains(system)), lower_bound(system)
     paths = [(system.law[i], i, u / p) for i, (u, p) in enumerate(zip(upper, system.law, strict=True))]
     for _ in range(9):
         paths = [
@@ -184,7 +184,7 @@ def test_bounds_enclose_the_mean_of_random_systems(seed):
     system = KnownLossSystem(a, q, chain, law, np.arange(3), outputs, noises)
     gains = find_gains(system)
     assert certify_radius(system, gains) < 1
-    upper = system.bound(gains)
+    upper = system.solve_steady_covariances(gains)
     paths = [(p, i, u / p) for i, (u, p) in enumerate(zip(upper, law, strict=True))]
     for _ in range(5):
         paths = [

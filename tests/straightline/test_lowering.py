@@ -85,7 +85,7 @@ def test_equal_expressions_are_one_node_and_what_nothing_needs_is_dropped():
 
 def test_a_product_with_zero_is_zero_only_of_finite_numbers():
     graph = Graph()
-    zero, data = graph.constant(0.0, "f64"), graph.fresh("load", "f64", (), graph.top, None)
+    zero, data = graph.constant(0.0, "f64"), graph.make_fresh_node("load", "f64", (), graph.top, None)
     flag = graph.node("gt", "bool", data, zero)
     assert graph.node("mul", "f64", zero, data).op == "mul"
     assert graph.node("mul", "f64", zero, graph.node("convert", "f64", flag)) is zero

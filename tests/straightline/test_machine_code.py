@@ -81,7 +81,7 @@ def test_calls_go_on_in_haste_while_care_is_taken(code):
 def test_code_in_haste_goes_on_where_care_fails_and_it_is_said_once(code, monkeypatch):
     before = code(STARTS)
     hasty = code.blocks.choose_machine(0)
-    monkeypatch.setattr("straightline.machine_code.Machine", lambda *arguments: [].pop())
+    monkeypatch.setattr("straightline.machine_code.MachineCode", lambda *arguments: [].pop())
     with pytest.warns(RuntimeWarning, match="native code: generated with care it failed .*pop from empty list.*haste"):
         assert code.blocks.choose_machine(OFTEN) is hasty
     with warnings.catch_warnings():
@@ -97,7 +97,7 @@ def test_a_call_that_executes_its_code_often_waits_for_care(code):
 
 
 def test_prepared_code_is_not_generated_by_the_first_call(code):
-    code.prepare()
+    code.generate_code()
     prepared = code.blocks.choose_machine(0)
     code(STARTS)
     assert code.blocks.choose_machine(0) is prepared

@@ -7,7 +7,7 @@ import pytest
 
 from straightline import present
 from straightline.lowering import list_nodes
-from straightline.machine_code import Machine
+from straightline.machine_code import MachineCode
 from straightline.program import SummedOutputs, fold_rows_into_batches, lower_function, row_length_of_sums
 from straightline.sums_over_runs import SummingProgram
 
@@ -29,7 +29,9 @@ def walk(start, number):
 def begun():
     with jax.enable_x64(True):
         program = lower_function(walk, np.float64(0), np.uint32(0))
-    return SummingProgram(program, SummedOutputs((True, False, False), BATCHES, 1)).begin([np.float64(2.0)], 40)
+    return SummingProgram(program, SummedOutputs((True, False, False), BATCHES, 1)).bind_arguments(
+        [np.float64(2.0)], 40
+    )
 
 
 def expected(runs):
@@ -43,7 +45,7 @@ def test_runs_are_added_to_their_batches(begun, count):
     """From any first run on, also where a block of lanes is not full or goes around the last batch."""
     for first in (0, 32, 96):
         runs, sums = np.arange(first, first + count), begun.make_zero_sums()
-        collected = begun.add(runs, sums)
+        collected = begun.add_runs(runs, sums)
         squares, positions = expected(runs)
         np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), squares, rtol=1e-14)
         np.testing.assert_array_equal(collected[1], positions)
@@ -55,7 +57,7 @@ def test_runs_are_added_to_their_batches(begun, count):
 def test_sums_go_on(begun):
     sums = begun.make_zero_sums()
     for start in range(0, 320, 32):
-        begun.add(np.arange(start, start + 32), sums)
+        begun.add_runs(np.arange(start, start + 32), sums)
     np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), expected(np.arange(320))[0], rtol=1e-14)
 
 
@@ -67,12 +69,12 @@ def test_sums_have_the_same_bits_whatever_the_number_of_runs_in_a_vector():
 
     with jax.enable_x64(True):
         program = lower_function(uneven, np.float64(0), np.uint32(0))
-    code = SummingProgram(program, SummedOutputs((True,), BATCHES, 1)).begin([np.float64(2.0)], 40)
+    code = SummingProgram(program, SummedOutputs((True,), BATCHES, 1)).bind_arguments([np.float64(2.0)], 40)
     results = []
     for width in (1, 2, 4, 8):
-        code._machine, sums = Machine(code.program.code.blocks, 0, width), code.make_zero_sums()
+        code._machine, sums = MachineCode(code.program.code.blocks, 0, width), code.make_zero_sums()
         for start, count in ((0, 37), (37, 120), (160, 53)):
-            code.add(np.arange(start, start + count), sums)
+            code.add_runs(np.arange(start, start + count), sums)
         results.append(sums[0])
     assert results[0][BATCHES:].any()
     for result in results[1:]:
@@ -96,13 +98,13 @@ def test_a_sum_of_what_is_used_again():
     with jax.enable_x64(True):
         program = lower_function(twice, np.float64(0), np.uint32(0))
     code, runs = (
-        SummingProgram(program, SummedOutputs((True, False), BATCHES, 1)).begin([np.float64(2.0)], 40),
+        SummingProgram(program, SummedOutputs((True, False), BATCHES, 1)).bind_arguments([np.float64(2.0)], 40),
         np.arange(40),
     )
     sums = code.make_zero_sums()
     squares, positions = expected(runs)
     before = np.cumsum(positions**2, axis=1) - positions**2
-    np.testing.assert_allclose(code.add(runs, sums)[1], before, rtol=1e-14)
+    np.testing.assert_allclose(code.add_runs(runs, sums)[1], before, rtol=1e-14)
     np.testing.assert_allclose(fold_rows_into_batches(sums[0], BATCHES), squares, rtol=1e-14)
 
 

@@ -45,7 +45,7 @@ class EngineChoice(NamedTuple):
     arrays: tuple[Any, ...] = ()
 
     @property
-    def explained(self) -> str:
+    def explanation(self) -> str:
         """Sentence "native: ..." with the number of operations, or "xla: ..." with the reason."""
         if self.code is None:
             return f"xla: {self.why}"
@@ -72,7 +72,7 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
+    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explanation
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
@@ -102,7 +102,7 @@ def choose_code(
         return EngineChoice(code=None, why=f"{SETTING} is set to it")
     choice = _find_compiled_code(function, arguments, differs, None if engine == "native" else most)
     # LLVM may refuse what was lowered: only an attempt shows it.
-    if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
+    if choice.code is not None and (why := choice.code.generate_code(choice.arrays)):
         choice = EngineChoice(code=None, why=why)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)

@@ -1,4 +1,4 @@
-"""Measured components that repeat others, noise and all: what rounding leaves of them says nothing.
+"""Measured components that repeat others, noise included: what rounding leaves of them carries no information.
 
 Take away from such a component what those before it say: its slopes and its noise are differences of equal numbers,
 zero, of which rounding leaves some eps. Its own noise, the rounding of numbers, is as small, so that slopes of some eps

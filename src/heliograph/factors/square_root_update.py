@@ -70,9 +70,9 @@ def observe_root(
     if order is not None:
         independent = np.take_along_axis(independent, order, axis=-1)
         rows[..., :m, :] = np.take_along_axis(rows[..., :m, :], order[..., None], axis=-2)
-    lower = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r")).swapaxes(
-        -1, -2
-    )  # the triangle: [[V, 0], [K V, W+]]
+    # The triangle [[V, 0], [K V, W+]]: transposed, it is R of the rows' QR.
+    upper = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r"))
+    lower = upper.swapaxes(-1, -2)
     v, k_v = lower[..., :m, :m], lower[..., m:, :m]
     gain = _solve_for_gain(v, k_v, independent)
     # The columns of K V that no gain uses stay in the root of what is left.

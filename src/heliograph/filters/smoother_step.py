@@ -143,7 +143,7 @@ class SmootherStep(Module):
         change = self.manifold.unsettle(before.ahead, self.after.mean) - before.ahead
         after = after._replace(mean=point.mean + after.through(change[:, None])[:, 0])
         # Of attitudes: errors about the mean after the step, in place of changes from that before the measurement.
-        reset = self.manifold.reset(change)
+        reset = self.manifold.reset_jacobian(change)
         if reset is None:
             return after
         return after._replace(link=after.through(jnp.linalg.inv(reset)), lower=jnp.zeros_like(after.lower))

@@ -87,6 +87,7 @@ class JumpSystem(NamedTuple):
 
     def steady(self) -> Any:
         """Solve for X (time, M, n, n) after each of steps that repeat for ever, of a radius below 1."""
+        # X after a period is a linear map of X before it, and what comes from no X: both are equal where it is steady.
         start = solve_fixed_point(
             self._replace(added=0.0 * self.added)._propagate_one_period,
             self._propagate_one_period(np.zeros(self.shape)),
@@ -131,25 +132,30 @@ class JumpSystem(NamedTuple):
 
 def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
-    _, where, basis = _place_in_triangles(shape)
+    _, where, basis = _place_in_upper_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
-    matrix, where = make_matrix_on_triangle_entries(linear, constant.shape), _place_in_triangles(constant.shape)[1]
+    matrix, where = (
+        make_matrix_on_triangle_entries(linear, constant.shape),
+        _place_in_upper_triangles(constant.shape)[1],
+    )
     solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
     return unpack_triangle_entries(solution, constant.shape)
 
 
 def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
     """Return symmetric matrices with these entries in their upper triangles."""
-    return entries[_place_in_triangles(shape)[0]]
+    return entries[_place_in_upper_triangles(shape)[0]]
 
 
 @lru_cache(8)
-def _place_in_triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
+def _place_in_upper_triangles(
+    shape: tuple[int, ...],
+) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
     """Return each matrix entry's place among those of the upper triangles, where these are, and unit matrices of each.
 
     A unit matrix has one of these entries, and its mirror image, at 1 and all else at zero.

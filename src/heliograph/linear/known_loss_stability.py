@@ -57,7 +57,7 @@ class KnownLossSystem(NamedTuple):
         added = [gains[s] @ r @ gains[s].T + self.process for s, r in zip(self.known, self.noises, strict=True)]
         return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))
 
-    def bound(self, gains: KindGains) -> Parts:
+    def solve_steady_covariances(self, gains: KindGains) -> Parts:
         """Return the steady U under gains of a radius below 1."""
         bound: Parts = mix_moments_of_modes(self.chain, self.close_loop(gains).steady()[0])
         return bound
@@ -188,7 +188,7 @@ class UnobservedGrowth(NamedTuple):
     vectors: Float[np.ndarray, "n d"]
 
 
-def find_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
+def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
     """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
     results: list[tuple[complex, np.ndarray]] = []
     size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
@@ -209,7 +209,7 @@ def find_fastest_unobserved_mode(
     """
     results = [
         UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
-        for value, space in find_eigenspaces(matrix)
+        for value, space in list_eigenspaces(matrix)
         for modes, vectors in _find_unobserving_modes(space, outputs)
     ]
     no_growth = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))

@@ -64,7 +64,7 @@ class CarriedRounding(NamedTuple):
         return CarriedRounding(rounding, worst, when)
 
 
-def take_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
+def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
     """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
     reach = np.abs(matrices.output) @ np.sqrt(size)
     return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, reach**2))
@@ -106,7 +106,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     instance("system", system, LinearSystem, "a LinearSystem")
     root, gains_by_step = roots_of(system.covariance), list[Gains]()
     second_moments = system.mean**2 + np.diag(system.covariance)
-    noises = take_noise_roots(system.step(0), second_moments)
+    noises = find_noise_roots(system.step(0), second_moments)
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
     steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
     for k in range(system.horizon):
@@ -119,7 +119,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
             before = now
         matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
-            noises = take_noise_roots(matrices, second_moments)
+            noises = find_noise_roots(matrices, second_moments)
         covariances = step_covariance_roots(root, matrices, noises)
         gains, root = _make_gains(system, matrices, covariances), covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)

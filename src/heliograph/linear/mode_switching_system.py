@@ -50,7 +50,7 @@ def modal_system(
         ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
             closed), fewer steps than the horizon.
     """
-    n = _check_square_maps(move, measure)
+    n = _find_state_size(move, measure)
     # Homogeneous coordinates y~ = (y, 1).
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
     spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
@@ -80,7 +80,7 @@ def modal_system(
     )
 
 
-def _check_square_maps(move: Channel, measure: Channel) -> int:
+def _find_state_size(move: Channel, measure: Channel) -> int:
     """Return n of a move from n to n numbers and a measurement of n numbers.
 
     Raises:

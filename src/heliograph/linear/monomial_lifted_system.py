@@ -30,7 +30,7 @@ from heliograph.random_affine.moments.monomials import (
     position,
 )
 from heliograph.random_affine.moments.pushed_moments import products_of_monomials, push_moments, push_through_known_map
-from heliograph.random_affine.noise import Gaussian, noise_vector
+from heliograph.random_affine.noise import Gaussian, noise_moment_vector
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -157,7 +157,7 @@ def _average_noise(
 
     `law` holds the modes' probabilities p_j, `lifts` each mode's map to Z, `moments` those of y.
     """
-    spreads, losses = zip(*(lift.conditional_spread(moments) for lift in lifts), strict=True)
+    spreads, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
     return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
 
 
@@ -267,10 +267,10 @@ def _lift_steps(
             measurement_lift = LiftedMap(route.measurement, degree, measurement_varies)
         last = route
         # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
-        process, rounding_of_process = plant_lift.conditional_spread(moments)
-        moments = plant_lift.push(moments)
+        process, rounding_of_process = plant_lift.mean_conditional_covariance(moments)
+        moments = plant_lift.push_moments(moments)
         check_finite_moments(moments, k, 2 * degree)
-        noise, rounding_of_noise = measurement_lift.conditional_spread(moments)
+        noise, rounding_of_noise = measurement_lift.mean_conditional_covariance(moments)
         transition, drift = split_homogeneous(plant_lift.matrix)
         output, offset = split_homogeneous(measurement_lift.matrix)
         steps.append(Steps(transition, drift, process, output, offset, noise))
@@ -310,14 +310,16 @@ class LiftedMap:
         self.highest = lowered[:, None] + lowered
         self.highest[~known[:, None] & ~known] = 2 * degree
 
-    def push(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
+    def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """Return E[mono(z)] from E[mono(y)], both of twice the degree."""
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
             return np.asarray(push_moments(self.route, 2 * self.degree, moments))
 
-    def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
+    def mean_conditional_covariance(
+        self, moments: Float[Array, "M"]
+    ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """Return E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
 
         Where the outputs in Z_i have a known gain, every term of Z_i - E[Z_i | y] has an n: it is a polynomial of y of
@@ -332,7 +334,7 @@ class LiftedMap:
             if not here[:-1, :-1].any():
                 continue
             low = np.where(self.given <= highest, np.asarray(moments), 0.0)
-            after = np.asarray(products_of_monomials(self.push(low), m, self.degree))
+            after = np.asarray(products_of_monomials(self.push_moments(low), m, self.degree))
             left = after - self.matrix @ np.asarray(products_of_monomials(low, n, self.degree)) @ self.matrix.T
             spread = np.where(here, left, spread)
             lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
@@ -373,7 +375,7 @@ def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
-    return np.asarray(push_through_known_map(shift, order, noise_vector(law, order)))
+    return np.asarray(push_through_known_map(shift, order, noise_moment_vector(law, order)))
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:

@@ -125,7 +125,7 @@ def _rounding_or_zero(given: ArrayLike | None, shape: tuple[int, ...]) -> np.nda
 
 
 class StateMoments(NamedTuple):
-    """Mean and covariance of y itself; entry 0 is the start."""
+    """Mean and covariance of the state y before any data, at each time; entry 0 is the start."""
 
     mean: Float[np.ndarray, "time+1 N"]
     covariance: Float[np.ndarray, "time+1 N N"]

@@ -42,7 +42,7 @@ class NativeFilterStepper:
 
         The code reads and writes the same arrays at each call: here they get names.
         """
-        self._code = code.again(numbers)
+        self._code = code.with_new_memory(numbers)
         # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state). Of both
         # the state's leaves are n.
         arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
@@ -153,7 +153,7 @@ def _judge_step(
         u: inputs (inputs,).
         k: step number.
     """
-    filter: AbstractFilter = static.filled(numbers)
+    filter: AbstractFilter = static.with_arrays(numbers)
     after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     # NaN in z did not arrive; infinite measurements and inputs that are no numbers are refused.
     unusable = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))

@@ -206,10 +206,10 @@ class _CompensatedEvaluation:
         """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
         if _scales_without_rounding(a) or _scales_without_rounding(b):
             return None
-        (a1, a2), (b1, b2) = self._split_digits(a), self._split_digits(b)
+        (a1, a2), (b1, b2) = self._split_digits_in_halves(a), self._split_digits_in_halves(b)
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
 
-    def _split_digits(self, a: Any) -> tuple[Any, Any]:
+    def _split_digits_in_halves(self, a: Any) -> tuple[Any, Any]:
         """Return a as a sum of two numbers of half as many digits.
 
         Source: Dekker, A floating-point technique for extending the available precision (1971).

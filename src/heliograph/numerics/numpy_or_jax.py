@@ -1,4 +1,4 @@
-"""Numbers that are known (NumPy float64) and numbers that JAX traces: arithmetic written once for both.
+"""Arithmetic written once for known numbers (NumPy float64) and for numbers that JAX traces.
 
 A model's moments are plain numbers in ordinary use, and functions of traced parameters under `jax.grad`, `jax.jvp` or
 `jax.jit`. What is decided by a number's value (is it zero, is it certain) is decided for known numbers only.

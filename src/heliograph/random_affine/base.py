@@ -316,7 +316,7 @@ class AbstractRandomAffine(Module):
 
 def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
-    return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
+    return [leaf for leaf in _flatten_to_inner_maps(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
 
 
 def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
@@ -326,7 +326,7 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
-    leaves, tree = _fields(channel)
+    leaves, tree = _flatten_to_inner_maps(channel)
     among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
     changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
     same = all(after is before for after, before in zip(changed, leaves, strict=True))
@@ -334,7 +334,7 @@ def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     return rebuilt
 
 
-def _fields(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
+def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
     """Return the leaves of a map, the maps inside it being leaves, and their tree."""
     return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
 

@@ -1,4 +1,4 @@
-"""Maps whose law depends on numbers that the receiver is told with each message: gains, readings of gains, quality.
+"""Maps whose law depends on numbers told to the receiver with each message: gains, readings of gains, quality.
 
 The world draws the numbers from a memory (`FreshNumbers`, a chain of modes); a told map is given them, and its receiver
 is told them, or readings of them.
@@ -114,7 +114,7 @@ class FreshReading(AbstractFreshDraw):
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
 
 
-class AbstractMapWithToldNumbers(AbstractModal):
+class AbstractToldMap(AbstractModal):
     """A map of which the receiver is told numbers with each message: `given` is the world's, `believed` the receiver's.
 
     names: names of the numbers. exogenous: whether they are independent of the state, so that they tell of the link
@@ -126,7 +126,7 @@ class AbstractMapWithToldNumbers(AbstractModal):
     fresh: eqx.AbstractVar[bool]
 
     @property
-    def reservation(self) -> str:
+    def reason_for_no_claim(self) -> str:
         """Why no claim is made of what is told, as it is said of the numbers; "" where one is."""
         said = ["depends on the state"] * (not self.exogenous)
         said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
@@ -155,7 +155,7 @@ class AbstractMapWithToldNumbers(AbstractModal):
         return jnp.all(jnp.isfinite(numbers))
 
 
-class ToldMap(AbstractMapWithToldNumbers):
+class ToldMap(AbstractToldMap):
     """A map that is a function of the numbers that are told.
 
     Args:
@@ -253,7 +253,7 @@ class ToldGainHop(eqx.Module):
         return GainAndNoise(Constant(numbers[0]), self.matrix, self.noise)
 
 
-class PilotedHop(AbstractHop, AbstractMapWithToldNumbers):
+class PilotedHop(AbstractHop, AbstractToldMap):
     """Hop z = g A y + n whose receiver is told a reading of its gain, as by a pilot: a = g + e.
 
     Args:
@@ -304,9 +304,9 @@ class PilotedHop(AbstractHop, AbstractMapWithToldNumbers):
         return f"{plain.in_words()} {self._describe_told_numbers('a reading of its gain')}"
 
 
-def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractMapWithToldNumbers]:
+def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
     """Return the maps in a channel of which numbers are told, one for each of the memories that draw them."""
-    by_identity: dict[str, AbstractMapWithToldNumbers] = {}
+    by_identity: dict[str, AbstractToldMap] = {}
     for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map):
         if _is_told_map(leaf):
             by_identity.setdefault(leaf.memory.identity, leaf)
@@ -334,7 +334,7 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
 
     def believe(leaf: object) -> object:
         """Return a map as its receiver knows it given its numbers, anything else as it is."""
-        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractMapWithToldNumbers) else leaf
+        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
     return conditioned
@@ -347,10 +347,8 @@ def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Arr
         channel: a channel.
         numbers: what is told of all its maps, one after another.
     """
-    parts = _share_numbers_by_map(channel, numbers)
-    return jnp.all(
-        jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in list_told_maps(channel)])
-    )
+    parts, told = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
+    return jnp.all(jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in told]))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
@@ -378,7 +376,7 @@ def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarr
     return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 
-def make_certain(link: T) -> T:
+def make_laws_certain(link: T) -> T:
     """Return a link whose laws of finitely many gains or modes are certain, whatever traces their numbers.
 
     Raises:
@@ -399,4 +397,4 @@ def make_certain(link: T) -> T:
 
 def _is_told_map(leaf: object) -> bool:
     """Return whether an object is a map of which numbers are told."""
-    return isinstance(leaf, AbstractMapWithToldNumbers)
+    return isinstance(leaf, AbstractToldMap)

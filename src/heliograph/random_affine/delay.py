@@ -128,7 +128,7 @@ class DelayedLink(AbstractDelayLine):
         self.times = _list_delays(delay)
         self.timestamped = instance("timestamped", timestamped, bool, "True or False")
         # The selection S_d of each possible delay, drawn by its law, by a chain, or certain.
-        selections = [_make_selection(d, self.past, link.inputs, timestamped) for d in self.times]
+        selections = [_make_delay_selection(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
                 self.delay = Mixture(selections, delay.probabilities, delay.radius)
@@ -176,7 +176,7 @@ class DelayedLink(AbstractDelayLine):
 
     def given(self, d: int) -> AbstractRandomAffine:
         """Return the map of the line for one delay d, without the time stamp."""
-        return Series([_make_selection(d, self.past, self.link.inputs, False), self.link])
+        return Series([_make_delay_selection(d, self.past, self.link.inputs, False), self.link])
 
 
 def _list_delays(delay: Delay) -> tuple[int, ...]:
@@ -193,7 +193,7 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
     return tuple(check_count("delay", d, 0) for d in values)
 
 
-def _make_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
+def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     """Return S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
@@ -360,11 +360,11 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
     # The links without delays behind one delay: the first link's own, and the constant ones.
     chain = Series([link.link if isinstance(link, DelayedLink) else link for link in links])
     constant_steps = sum(link.times[0] for link in added)
-    delay = constant_steps if first is None else _add_delay(first, constant_steps)
+    delay = constant_steps if first is None else _lengthen_delay(first, constant_steps)
     return DelayedLink(chain, delay, timestamped=any(timestamped))
 
 
-def _add_delay(link: DelayedLink, more: int) -> Delay:
+def _lengthen_delay(link: DelayedLink, more: int) -> Delay:
     """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps."""
     match link.delay:
         case Mixture():

@@ -282,9 +282,12 @@ class Autoregression(AbstractMemory):
         n = check_count("modes of a fading", modes, 2) - 1
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
-        rows = [xp.convolve(_compute_binomial(i, stays), _compute_binomial(n - i, 1 - stays)) for i in range(n + 1)]
+        rows = [
+            xp.convolve(_compute_binomial_probabilities(i, stays), _compute_binomial_probabilities(n - i, 1 - stays))
+            for i in range(n + 1)
+        ]
         return MemoryStates(
-            np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial(n, np.asarray(0.5)), xp.stack(rows)
+            np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows)
         )
 
 
@@ -307,7 +310,7 @@ def identify_memory(name: str | None) -> str:
     return uuid4().hex if name is None else f"named {name}"
 
 
-def _compute_binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     """Return the probabilities of 0, ..., n successes."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)

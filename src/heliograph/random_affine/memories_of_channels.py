@@ -1,4 +1,4 @@
-"""Memories of maps: those that a channel holds, the channel given their states, and memories told apart or made one."""
+"""Memories (modes, drifting gains) of channels: list them, condition a channel on their states, replace them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar

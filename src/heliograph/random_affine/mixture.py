@@ -110,7 +110,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Visit each map as a choice with transmitters of its own; a hop and its loss are one."""
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)
-        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "choice")]
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "choice")]
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:

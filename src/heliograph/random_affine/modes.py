@@ -250,7 +250,7 @@ def joint_modes(
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     # Each memory as finitely many states.
     held = memories((beside, channel))
-    chains = [_nodes_of_memory(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
+    chains = [_represent_memory_by_nodes(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -277,7 +277,7 @@ def joint_modes(
     )
 
 
-def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
+def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
     """Return a memory as finitely many states, as many as its degree in the channel asks for."""
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)

@@ -394,7 +394,7 @@ def count_components(value: NoiseLike) -> int | None:
 
 
 @singledispatch
-def noise_vector(noise: AbstractNoise, order: int) -> Vector:
+def noise_moment_vector(noise: AbstractNoise, order: int) -> Vector:
     """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
     moment = noise.moment  # of a module, whose methods are slow to look up
     return stack_parts([moment(powers[:-1]) for powers in list_exponents(noise.dimension + 1, order)])

@@ -75,7 +75,7 @@ class StudentT(AbstractNoise):
         """Return each component as a mixture of Gaussian branches, one for each of the PRECISIONS."""
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
-        shares = xp.broadcast_to(_take_log(precision_shares(self.degrees)), shape)
+        shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
         return GaussianBranches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
@@ -135,8 +135,8 @@ class Contaminated(AbstractNoise):
         n = inlier.shape[-1]
         outlier_shares, are_several = _read_shares(share)
         kinds = len(outlier_shares)
-        outliers = _check_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
-        biases = _check_matrices("bias of the outliers", bias, kinds, are_several)
+        outliers = _read_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
+        biases = _read_matrices("bias of the outliers", bias, kinds, are_several)
         xp = library(inlier, outlier_shares, outliers, biases)
         spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
         centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
@@ -204,7 +204,7 @@ class Contaminated(AbstractNoise):
     def branches(self) -> GaussianBranches:
         """Return each component as a mixture of Gaussian branches about the mean, those of the law."""
         xp, n = library(self.shares), self.dimension
-        shares = xp.broadcast_to(_take_log(self.shares), (n, len(self.shares)))
+        shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
         return GaussianBranches(shares, (self.means - self.mean).T, variances)
 
@@ -225,7 +225,7 @@ class Contaminated(AbstractNoise):
         return sum((plain(p) * Gaussian(r, m).moment(powers) for p, r, m in items), start=0.0)
 
 
-def precision_shares(degrees: ArrayLike) -> Vector:
+def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
     """Return the gamma law's mass of l between geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
     xp: Any = library(degrees)
     half = xp.asarray(degrees) / 2
@@ -264,7 +264,7 @@ def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
     return list(values), True
 
 
-def _check_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
+def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
     """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many."""
     if not several:
         return [value]
@@ -288,7 +288,7 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
     return first, second - first**2
 
 
-def _take_log(value: Vector) -> Vector:
+def _log_or_minus_infinity(value: Vector) -> Vector:
     """Return the logarithms, -inf of zero without a warning."""
     if is_traced(value):
         return jnp.log(value)

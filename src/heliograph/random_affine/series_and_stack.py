@@ -162,7 +162,7 @@ class Series(AbstractCombination):
 
     def _outcomes(self) -> list[ArrivalOutcome]:
         """Return the sets of losses: an output is lost where a map loses it, or has a gain on what one before lost."""
-        return reduce(partial(_join_outcomes, join=_join_in_series), (m.list_outcomes() for m in self.maps))
+        return reduce(partial(_join_outcomes, join=_join_outcomes_in_series), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[AffineComponent]:
         """Return every atom of each map, one after another."""
@@ -197,7 +197,7 @@ class Series(AbstractCombination):
         return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
 
 
-def _join_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
     received = known(np.diag(x.arrived.astype(float)))
     power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
@@ -282,7 +282,7 @@ class Stack(AbstractCombination):
 
     def _outcomes(self) -> list[ArrivalOutcome]:
         """Return every set of losses of each map with every one of the others."""
-        return reduce(partial(_join_outcomes, join=_join_in_stack), (m.list_outcomes() for m in self.maps))
+        return reduce(partial(_join_outcomes, join=_join_outcomes_in_stack), (m.list_outcomes() for m in self.maps))
 
     def list_atoms(self) -> list[AffineComponent]:
         """Return every atom of each map, one above another."""
@@ -306,11 +306,11 @@ class Stack(AbstractCombination):
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as one part; return the whole as they became, and the place after it."""
-        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "part")]
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "part")]
         return self.rebuilt(*visited), position
 
 
-def _join_in_stack(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+def _join_outcomes_in_stack(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y below x, and which of the outputs of both arrive."""
     return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
 

@@ -32,7 +32,7 @@ from heliograph.random_affine.moments.monomials import (
     times_one,
 )
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners, Series, Stack
 
 Places = tuple[int, ...]  # of what a map takes, among the components of y
@@ -178,8 +178,8 @@ class Superposed(AbstractCombination):
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as one link, with the part of the signal that it takes."""
-        parts = zip(position.number(self.maps, "link"), self.places, strict=True)
-        visited = [affine.visit_hops(visit, at.select(taken))[0] for (affine, at), taken in parts]
+        parts = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
+        visited = [affine.visit_hops(visit, at.select_components(taken))[0] for (affine, at), taken in parts]
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
@@ -187,12 +187,12 @@ class Superposed(AbstractCombination):
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
-            _expand_map(matrix, m.outputs, chosen, order)
+            _expand_map_moments(matrix, m.outputs, chosen, order)
             for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
         ]
         # The noise as a map that takes nothing.
-        noise = _expand_map(noise_vector(self.noise, order)[None, :, None], self.outputs, (), order)
-        powers = _add_powers(_sum_by_halves(terms, self.outputs), noise, self.outputs)
+        noise = _expand_map_moments(noise_moment_vector(self.noise, order)[None, :, None], self.outputs, (), order)
+        powers = _add_independent_moments(_sum_maps_by_halves(terms, self.outputs), noise, self.outputs)
         return _assemble_moments(powers, self.outputs, self.inputs, order)
 
 
@@ -206,7 +206,7 @@ class _SumMoments(NamedTuple):
     by_degree: list[Corners]
 
 
-def _expand_map(matrix: Corners, outputs: int, places: Places, order: int) -> _SumMoments:
+def _expand_map_moments(matrix: Corners, outputs: int, places: Places, order: int) -> _SumMoments:
     """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner.
 
     Args:
@@ -234,15 +234,17 @@ def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarr
     return place_monomials(np.pad(alone, ((0, 0), (0, order - degree)), constant_values=outputs), outputs + 1)
 
 
-def _sum_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
+def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
     """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
-    return _add_powers(_sum_by_halves(terms[:middle], outputs), _sum_by_halves(terms[middle:], outputs), outputs)
+    return _add_independent_moments(
+        _sum_maps_by_halves(terms[:middle], outputs), _sum_maps_by_halves(terms[middle:], outputs), outputs
+    )
 
 
-def _add_powers(a: _SumMoments, b: _SumMoments, outputs: int) -> _SumMoments:
+def _add_independent_moments(a: _SumMoments, b: _SumMoments, outputs: int) -> _SumMoments:
     """Return the powers of a sum t + r of independent maps at each pair of corners, those of t slowest.
 
     E[(t + r)^c | y] = sum_{b <= c} C(c, b) E[t^b | y] E[r^(c-b) | y].

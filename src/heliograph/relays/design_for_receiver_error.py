@@ -16,11 +16,11 @@ from heliograph.relays.bfgs import bfgs
 from heliograph.relays.design import (
     RelayDesign,
     given_design,
+    initial_error_covariance,
     join_gains,
     local_error_design,
     make_receiver_cost,
     split_gains,
-    start_moments,
 )
 from heliograph.relays.error_moments import (
     correct_moments,
@@ -51,7 +51,7 @@ class PowerLimit(NamedTuple):
     limit: Float[Array, "*time"]
 
 
-class LimitedProblem(NamedTuple):
+class PowerLimitedProblem(NamedTuple):
     """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
 
     steps: RelaySteps
@@ -60,7 +60,7 @@ class LimitedProblem(NamedTuple):
     power: PowerLimit
 
 
-def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
+def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
     """Return the limit on the moments after each step, from one on the power that all relays send at each step.
 
     Raises:
@@ -84,7 +84,10 @@ def power_limit_of(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 
 
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
-    """Return the matrices with <form_k, moments before step k> = sum over transmitting relays of tr Cov(C s_r)."""
+    """Return form_k: <form_k, moments before step k> is the sum over the transmitting relays of tr Cov(C s_r).
+
+    <A, B> = tr A' B; s_r is relay r's estimate, C what is sent of it, and `d` the size of the moments.
+    """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
     for r in range(len(steps.received) - 1):
@@ -96,7 +99,7 @@ def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d
 
 
 def minimise_within_limit(
-    problem: LimitedProblem, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
+    problem: PowerLimitedProblem, local_gains: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
     """Return the gains of small cost that meet the limit; never dearer than `local_gains`, if those meet it.
 
@@ -137,7 +140,7 @@ def minimise_within_limit(
 
 
 def _scale_into_limit(
-    problem: LimitedProblem, local_gains: Float[np.ndarray, "time Fn R"]
+    problem: PowerLimitedProblem, local_gains: Float[np.ndarray, "time Fn R"]
 ) -> Float[np.ndarray, "time Fn R"]:
     """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
     relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
@@ -160,7 +163,7 @@ def _scale_into_limit(
 
 @compile_in_float64
 def _compute_cost_and_slack(
-    problem: LimitedProblem, gains: Float[Array, "time Fn R"]
+    problem: PowerLimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
     """Return the cost of given gains, and the share of each limit that they leave free."""
     moments = propagate_error_moments(problem.steps, problem.start, gains).moments[1:]
@@ -179,7 +182,11 @@ def _change_gains(
 
 @compile_in_float64
 def _compute_cost_with_barrier(
-    problem: LimitedProblem, gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], barrier: float, x: Array
+    problem: PowerLimitedProblem,
+    gains: Float[Array, "time Fn R"],
+    units: Float[Array, "time r r"],
+    barrier: float,
+    x: Array,
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
     """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
@@ -195,7 +202,11 @@ def _compute_cost_with_barrier(
 
 
 def _evaluate_barrier(
-    problem: LimitedProblem, gains: np.ndarray, units: np.ndarray, barrier: float, x: Float[np.ndarray, "variables"]
+    problem: PowerLimitedProblem,
+    gains: np.ndarray,
+    units: np.ndarray,
+    barrier: float,
+    x: Float[np.ndarray, "variables"],
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return `_compute_cost_with_barrier` of all variables in one vector."""
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
@@ -204,7 +215,7 @@ def _evaluate_barrier(
 
 @compile_in_float64
 def _choose_step_units(
-    problem: LimitedProblem, gains: Float[Array, "time Fn R"], barrier: float
+    problem: PowerLimitedProblem, gains: Float[Array, "time Fn R"], barrier: float
 ) -> Float[Array, "time r r"]:
     """Return units (columns) of the r free gains of each step, in which the cost curves alike in all directions.
 
@@ -276,15 +287,15 @@ def receiver_error_design(
     weights = 1 / (horizon * design.trace("receiver")[1:]) if weights is None else array("weights", weights, (horizon,))
     if np.any(weights < 0) or sweeps < 1:
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")
-    steps, start = network.steps(horizon), start_moments(network)
+    steps, start = network.steps(horizon), initial_error_covariance(network)
     cost = make_receiver_cost(weights, len(network.filters), len(network.states))
     # From the gains with which each filter minimises its own error.
     local_gains = join_gains(network, design.gains)
     if power_limit is None:
         gains = _alternate_sweeps(steps, start, cost, local_gains, np.arange(sweeps))
     else:
-        limit = power_limit_of(steps, power_limit, start.shape[0])
-        problem = LimitedProblem(steps=steps, start=start, cost=cost, power=limit)
+        limit = make_power_limit(steps, power_limit, start.shape[0])
+        problem = PowerLimitedProblem(steps=steps, start=start, cost=cost, power=limit)
         gains = minimise_within_limit(problem, local_gains, STEPS * sweeps)
     return given_design(network, split_gains(network, np.asarray(gains)))
 

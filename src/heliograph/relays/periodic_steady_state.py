@@ -16,14 +16,14 @@ from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.design import (
     GainsByFilter,
+    ReceiverViewOfRelays,
     RelayDesign,
-    RelaySide,
+    initial_error_covariance,
     join_gains,
     make_design,
-    make_relay_side,
+    make_receiver_view,
     relay_gains,
     split_gains,
-    start_moments,
 )
 from heliograph.relays.error_moments import PropagatedMoments, correct_moments, propagate_error_moments, regression_gain
 from heliograph.relays.power_limited_descent import Cost, make_penalised_cost, minimise_over_gains
@@ -33,7 +33,7 @@ PERIODS = 100_000
 GAINS_CONVERGED = 1e-9  # the same for a covariance that only gives gains: their error enters it squared
 INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
 
-SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
+RepeatedPeriods = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
 
 
 def periodic_steps(network: RelayNetwork) -> RelaySteps:
@@ -65,7 +65,7 @@ def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not converge.
     """
-    propagated, change = _iterate_local_design(periodic_steps(network), start_moments(network))
+    propagated, change = _iterate_local_design(periodic_steps(network), initial_error_covariance(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
     return make_design(network, propagated)
@@ -85,7 +85,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined = join_gains(network, gains)
-    return make_design(network, _steady(_return_converging_steps(network, joined), joined))
+    return make_design(network, _steady(_make_converging_steps(network, joined), joined))
 
 
 def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
@@ -100,10 +100,10 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined, n = relay_gains(network, gains), len(network.states)
-    return np.asarray(_steady_behind(_return_converging_steps(network, joined), joined))[:, :n, :n]
+    return np.asarray(_steady_behind(_make_converging_steps(network, joined), joined))[:, :n, :n]
 
 
-def _return_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
+def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
     """Return the steps of one period, checked for gains under which the second moments converge."""
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
@@ -150,21 +150,21 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         gains: of all filters as one block matrix for each slot; those of the receiver are not used.
     """
     moments = steady_moments(steps, gains).moments[:-1]
-    sides = jax.vmap(make_relay_side)(steps, moments, gains)
+    sides = jax.vmap(make_receiver_view)(steps, moments, gains)
     d = sides.transition.shape[-1]
 
-    def predict(covariance: jax.Array, side: RelaySide) -> jax.Array:
+    def predict(covariance: jax.Array, side: ReceiverViewOfRelays) -> jax.Array:
         """Return the covariance of (x, e_relays) and z after a slot, before the correction."""
         both = jnp.concatenate([side.transition, side.output])
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
-    def correct_best(covariance: jax.Array, side: RelaySide) -> tuple[jax.Array, jax.Array]:
+    def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
         """Take one Riccati step: return the covariance after a slot, and the best gain."""
         joint = predict(covariance, side)
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
 
-    def correct_with(covariance: jax.Array, row: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
         side, gain = row
         corrected = correct_moments(predict(covariance, side), gain)
@@ -221,14 +221,14 @@ def _repeat_until_steady(
 ) -> tuple[jax.Array, jax.Array]:
     """Repeat a period until its relative change is below `tolerance`; return the last value and its change."""
 
-    def repeat(carry: SteadyState) -> SteadyState:
+    def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
         """Return the value after one more period, its relative change, and the count of periods."""
         value, _, count = carry
         after = period(value)
         size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
         return after, jnp.max(jnp.abs(after - value)) / size, count + 1
 
-    def changes(carry: SteadyState) -> jax.Array:
+    def changes(carry: RepeatedPeriods) -> jax.Array:
         """Return whether the last change is above the tolerance, and periods are left."""
         _, change, count = carry
         return (change > tolerance) & (count < PERIODS)

@@ -113,7 +113,7 @@ def certify_boundedness(network: Network) -> Boundedness:
         gains = find_gains(known.system)
         radius = certify_radius(known.system, gains)
         if radius < BELOW_ONE:
-            bound = known.system.bound(gains).sum(axis=0) if known.exact else None
+            bound = known.system.solve_steady_covariances(gains).sum(axis=0) if known.exact else None
             return Boundedness(
                 verdict="certified",
                 reason=_describe_certificate(a, radius),

@@ -1,4 +1,4 @@
-"""A long recording smoothed in chunks of rows side by side, where a filter forgets how it began and how it will end.
+"""Smoothing of a long recording in chunks of rows side by side: a filter forgets how it began and how it will end.
 
 A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`) over its own rows and as many
 behind them as are forgotten, and passed through backwards from the filtered state there. Of the state between two

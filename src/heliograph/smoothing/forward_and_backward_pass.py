@@ -1,4 +1,7 @@
-"""Passes over the smoother steps of one run: back from its end, back over a lag, or ahead with one state."""
+"""Passes of a smoother: the filter ahead, which collects a smoother step of each row, and back over these steps.
+
+Back from the end of a run (fixed interval), back over each lag, or ahead with one state (fixed point).
+"""
 
 from typing import TypeVar
 
@@ -47,7 +50,10 @@ def smoother_steps(
 def filter_rows_with_smoother_steps(
     filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
 ) -> tuple[PyTree, SmootherStep]:
-    """Step a filter over rows of data inside a compiled computation, like `smoother_steps`."""
+    """Run a filter over rows of data; return its state after them, and the smoother step of each row, compiled.
+
+    As `smoother_steps`, of arrays that are checked, from `state` before the row of step `first`.
+    """
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
         return filter.step_with_smoother(state, *row)
@@ -57,7 +63,7 @@ def filter_rows_with_smoother_steps(
 
 
 def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
-    """Plan the filter for these inputs and complete data, with its smoother steps but for their data."""
+    """Return the filter planned for these inputs and complete data, with its smoother steps but for their means."""
     planned = filter.planned(inputs)
     if planned is filter:
         return filter

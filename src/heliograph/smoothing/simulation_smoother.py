@@ -68,6 +68,7 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Draw the filter's state between two steps, given the one drawn after both; keep the plant's."""
         previous, step, key = pair
+        # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
         left, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
         x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))

@@ -1,4 +1,4 @@
-"""Chunks of complete rows smoothed where covariances stand still: means alone move, forwards and back.
+"""Smoothing of chunks of complete rows in which covariances are steady: only means are computed, ahead and back.
 
 The pass back over the rows of a settled filter is a recursion as its pass ahead is: of the smoothed law, with the parts
 of a smoother step that depend on data as its rows. Its covariance settles too, some rows before the end.

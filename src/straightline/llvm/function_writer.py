@@ -17,7 +17,7 @@ from straightline.llvm.operations import (
     write_operation,
     write_splat,
 )
-from straightline.llvm.prefetch import PrefetchedRows, write_requests
+from straightline.llvm.prefetch import PrefetchedRows, write_prefetch_requests
 from straightline.llvm.vector_types_and_gathers import WIDTH, gather_name
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import find_fused_product
@@ -192,9 +192,7 @@ class FunctionWriter:
             return first
         return self.add(f"shufflevector {kind} {first}, {kind} poison, %i32 zeroinitializer")
 
-    def _write_entry_address(
-        self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str
-    ) -> str:
+    def _locate(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
         """Return the address of entry offset + sum strides * indices; `entry` is the type of one."""
         owner, start = buffer.owner
         base = self._write_base(owner)
@@ -239,7 +237,7 @@ class FunctionWriter:
             return self._write_gather(node)
         if buffer.owner[0] not in self.spread:
             return self.write_broadcast(self._write_scalar_load(node), node.type)
-        address = self._write_entry_address(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
+        address = self._locate(buffer, offset, strides, node.args, f"%i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne %i8 {self.add(f'load %i8, ptr {address}, align 1')}, zeroinitializer")
         return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
@@ -248,7 +246,7 @@ class FunctionWriter:
         """Load a number that all lanes share."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
-        address = self._write_entry_address(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
+        address = self._locate(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
         if node.type == "bool":
             return self.add(f"icmp ne i8 {self.add(f'load i8, ptr {address}, align 1')}, 0")
         return self.add(f"load {LLVM[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
@@ -278,7 +276,7 @@ class FunctionWriter:
         """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
-        address = self._write_entry_address(store.buffer, store.offset, store.strides, store.indices, entry)
+        address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
         if store.buffer in self.sums:  # of doubles
             if store.node.type == "f32":
                 name, kind = self.add(f"fpext {kind} {name} to %double"), "%double"
@@ -309,7 +307,7 @@ class FunctionWriter:
         self._name_parameters(loop, name, counter, carried)
         if loop is self.asking_loop:  # it asks for memory before that is used
             for rows in self.asked_rows:
-                requests = write_requests(rows, loop.length or 1, counter, WIDTH, self.add)
+                requests = write_prefetch_requests(rows, loop.length or 1, counter, WIDTH, self.add)
                 self.lines += [f"  {line}" for line in requests]
         # Counted: body, then the latch. Conditional: the check is inside the body.
         if loop.condition is None:
@@ -393,7 +391,7 @@ class FunctionWriter:
         self.start_basic_block(f"{name}.end")
         self.scopes.pop()
         # A phi node each: the value behind the body, zero where that was skipped. All phi nodes come first, before
-        # what `_name` may write of one.
+        # what `_note_name` may write of one.
         merged = []
         for k, value in zip(used, values, strict=True):
             kind = vector_type(guard.results[k].type)

@@ -38,7 +38,7 @@ class ProgramParts(NamedTuple):
         return [x for x in self.items if isinstance(x, Buffer) and x.kind == "table"]
 
     @property
-    def pointers(self) -> list[Buffer]:
+    def passed_buffers(self) -> list[Buffer]:
         """Return the buffers whose addresses a caller passes."""
         return [*self.program.inputs, *self.tables, *self.outputs]
 
@@ -48,7 +48,7 @@ class ProgramParts(NamedTuple):
         return [b not in self.spread for b in self.outputs]
 
     @property
-    def added(self) -> list[Buffer]:
+    def outputs_summed_in_memory(self) -> list[Buffer]:
         """Return the outputs that are summed over runs."""
         if self.summed is None:
             return []
@@ -127,7 +127,7 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     has a place for each turn.
     """
     owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
-    added = set(parts.added)
+    added = set(parts.outputs_summed_in_memory)
     _check_sums(parts.items, added)
     used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
     own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]

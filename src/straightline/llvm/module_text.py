@@ -20,7 +20,7 @@ from straightline.llvm.memory_layout import (
     split_shared_from_differing,
 )
 from straightline.llvm.operations import BITS
-from straightline.llvm.prefetch import PrefetchedRows, count_lines_per_turn, find_longest_loop
+from straightline.llvm.prefetch import PrefetchedRows, count_cache_lines_per_turn, find_longest_loop
 from straightline.llvm.transposition import FEW, MoverOptions, write_mover
 from straightline.llvm.vector_types_and_gathers import (
     WIDTH,
@@ -29,7 +29,7 @@ from straightline.llvm.vector_types_and_gathers import (
     write_subnormal_flush,
     write_vector_types,
 )
-from straightline.lowering import Lowering, Value, refuse_failures
+from straightline.lowering import Lowering, Value, turn_failures_into_refusals
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
 from straightline.periodic_loop_values import reuse_recurring_values
 from straightline.program import (
@@ -39,7 +39,7 @@ from straightline.program import (
     find_fusable_products,
     list_needed_items,
     row_length_of_sums,
-    sort_items,
+    sort_items_by_dependence,
 )
 from straightline.rules.loops import copy_in_memory
 from straightline.rules.random_bits import write_hash_function
@@ -113,12 +113,14 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
     results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
         must_store = number in last or not isinstance(value, StridedArray)
-        stored = _store_in_memory(lowering, value) if must_store else _find_or_copy(lowering, value, results)
+        stored = (
+            _store_in_memory(lowering, value) if must_store else _find_whole_buffer_or_copy(lowering, value, results)
+        )
         results.append(stored.buffer)
     return results
 
 
-def _find_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
+def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
     """Return an array's buffer if it is all of one that the program filled; else copy the array."""
     buffer = value.buffer
     whole = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
@@ -136,10 +138,10 @@ def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
     for index, node in enumerate(flat):
         lowering.graph.store(buffer, node, index, (), ())
-    return StridedArray.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
-@refuse_failures("the text of a program")
+@turn_failures_into_refusals("the text of a program")
 def write_module(
     program: Program,
     differing: Iterable[bool],
@@ -166,7 +168,9 @@ def write_module(
         Unsupported: an operation that LLVM's text does not have here, or a program that is too long.
     """
     outputs = choose_output_buffers(program, last)
-    items = sort_items(reuse_recurring_values(program.graph, outputs) if alone else list_needed_items(outputs))
+    items = sort_items_by_dependence(
+        reuse_recurring_values(program.graph, outputs) if alone else list_needed_items(outputs)
+    )
     counts = _count_operations(items)
     parts = split_shared_from_differing(program, items, outputs, differing, width, alone, summed)
     # The items of the function of blocks, and where the numbers lie.
@@ -243,7 +247,7 @@ def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: M
     runs side by side, as lanes of a vector. W, the runs of a vector, is a type's size in the text: it is chosen when
     code is generated. Where there is one run (`parts.alone`), nothing is transposed.
     """
-    names = _write_pointers(writer, parts.pointers, layout.in_shared)
+    names = _write_pointers(writer, parts.passed_buffers, layout.in_shared)
     for buffer, offset in layout.in_scratch.items():
         writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {offset}")
     # Loop over blocks; the block `number` has runs from `first` on.
@@ -261,7 +265,7 @@ def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: M
     _request_rows_ahead(writer, parts, names, moved_inputs, moved_outputs)
     if parts.summed is not None:
         number = parts.program.inputs[parts.summed.number]
-        _add_to_sums(writer, parts.summed, names, number, parts.added, parts.width)
+        _add_to_sums(writer, parts.summed, names, number, parts.outputs_summed_in_memory, parts.width)
     writer.write_block(parts.program.graph.top)
     movers |= {
         _write_mover_call(writer, names, buffer, "give") for buffer in moved_outputs if buffer not in writer.sums
@@ -307,7 +311,9 @@ def _locate_rows(
         bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
         place = writer.add(f"mul i64 {'%first' if writes else first_of_next}, {bytes_of_run}")
         start = writer.add(f"getelementptr i8, ptr {names[buffer]}, i64 {place}")
-        results.append(PrefetchedRows(start, bytes_of_run, count_lines_per_turn(bytes_of_run, width, loop), writes))
+        results.append(
+            PrefetchedRows(start, bytes_of_run, count_cache_lines_per_turn(bytes_of_run, width, loop), writes)
+        )
     return results
 
 
@@ -362,7 +368,7 @@ def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: 
     needed = list_needed_items(roots)
     writer = FunctionWriter(single=True, mine=needed, products=blocks.products, spread=set(), slots=blocks.slots)
     writer.turning, writer.flushes = blocks.turning, blocks.flushes
-    _write_pointers(writer, parts.pointers, layout.in_shared)
+    _write_pointers(writer, parts.passed_buffers, layout.in_shared)
     writer.write_block(parts.program.graph.top)
     return _finish_source(_write_run_function("\n".join(writer.lines), writer), writer, [])
 

@@ -130,7 +130,9 @@ def _read_guarded_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
         return value
     if value in guard.values:
         return guard.results[guard.values.index(value)]
-    guarded = lowering.graph.fresh("guarded", value.type, (), lowering.graph.current, (guard, len(guard.values)))
+    guarded = lowering.graph.make_fresh_node(
+        "guarded", value.type, (), lowering.graph.current, (guard, len(guard.values))
+    )
     guard.values.append(value)
     guard.results.append(guarded)
     return guarded

@@ -83,7 +83,7 @@ def _make_row_by_row_rule(name: str) -> Rule:
 
         def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
             """Return no carry, and the operation's result for one row."""
-            rows = [take_row(lowering, x, row, ndim) for x in items]
+            rows = [take_row_of_argument(lowering, x, row, ndim) for x in items]
             return [], list(lowering.lower_equation(row_equation, rows))
 
         return list(repeat_turns(lowering, shape[0], [], lambda p, c: load_as_nodes(lowering, turn(p, c)))[1])
@@ -99,7 +99,7 @@ def load_as_nodes(
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
-def take_row(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
+def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
     """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
     if x.ndim < ndim:
         return x

@@ -29,7 +29,7 @@ def repeat_turns(
 
     def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
         """Return the next carry, and the memory in which each turn stores a row."""
-        loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
+        loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
         following, stacked = turn(row, carry)
         return following, [_store_row(lowering, length, x, counter, backwards, outer) for x in stacked]
@@ -77,7 +77,7 @@ def _lower_loop(
 
 def _make_carried_nodes(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
     """Make a node for each carried number, which stands for it in the body ("parameter") or after it ("result")."""
-    return [graph.fresh(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
+    return [graph.make_fresh_node(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
 
 
 def is_symmetric(x: np.ndarray) -> bool:
@@ -109,7 +109,7 @@ def _store_row(
     start, stride = ((length - 1) * size, -size) if backwards else (0, size)
     for entry, node in enumerate(flat):
         lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
-    return StridedArray.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
 def _list_nodes_of_numbers(value: np.ndarray) -> list[Node]:
@@ -138,11 +138,11 @@ def _restore_arrays(
             for x in old_entries.ravel().tolist()
         ]
         restored = arrange_nodes(new_entries, old_entries.shape)
-        results.append(_mirror(restored, n) if has_triangle else restored)
+        results.append(_mirror_triangles(restored, n) if has_triangle else restored)
     return results
 
 
-def _mirror(upper: np.ndarray, n: int) -> np.ndarray:
+def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
     # The place of each entry in its row: those below the diagonal, 0 here, have the place of the entry across it.
     places = np.zeros((n, n), dtype=int)
@@ -156,7 +156,7 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     The arguments of a scan are constants, the carry, and arrays of which each turn gets a row.
     """
     params = equation.params
-    (consts, carried), length = _count_arguments(params), params["length"]
+    (consts, carried), length = _count_scan_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
     if size <= lowering.written_out or length <= 1:  # a loop of one turn would be no shorter
@@ -224,7 +224,7 @@ class CarriedMemory:
     def _view_part(self, buffer: Buffer) -> StridedArray:
         """Place a buffer in this memory; return the view of it."""
         self.memory.place_buffer_inside(buffer, 0)
-        return StridedArray.whole(buffer)
+        return StridedArray.of_whole_buffer(buffer)
 
 
 def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
@@ -239,7 +239,7 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
         carried.fill(lowering, x)
 
 
-def _count_arguments(params: dict[str, Any]) -> tuple[int, int]:
+def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
     """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
@@ -281,11 +281,11 @@ def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
     type: Type = flat[0].type if flat else "f64"
     if all(n.op == "constant" for n in flat):
         table = np.array([n.value for n in flat]).reshape(value.shape)
-        return StridedArray.whole(Buffer("table", type, value.shape, graph.top, table))
+        return StridedArray.of_whole_buffer(Buffer("table", type, value.shape, graph.top, table))
     buffer = Buffer("scratch", type, value.shape, graph.current)
     for index, node in enumerate(flat):
         graph.store(buffer, node, index, (), ())
-    return StridedArray.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
 def copy_in_memory(lowering: Lowering, x: StridedArray) -> StridedArray:

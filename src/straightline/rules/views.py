@@ -208,7 +208,7 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
         else:
             _copy_into(lowering, x, buffer, start)
         start += x.size
-    return StridedArray.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
 def _is_whole_buffer(x: StridedArray, block: Any) -> bool:

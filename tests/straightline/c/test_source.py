@@ -26,7 +26,7 @@ def written(function, x, real="double"):
     results = [node for array in arrays for node in list_nodes(array)]
     source = CSource(results, {program.inputs[0]: "x[{}]".format}, real, "made")
     body = source.write_statements(program.graph.top)
-    stores = [f"    out[{i}] = {source.name(node)};" for i, node in enumerate(results)]
+    stores = [f"    out[{i}] = {source.name_node(node)};" for i, node in enumerate(results)]
     return [*source.declarations(), *body, *stores], source.table_definitions(), len(results)
 
 

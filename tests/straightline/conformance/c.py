@@ -61,7 +61,8 @@ def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[in
     for flat, x in zip(nodes, program.outputs, strict=True):
         kind = flat[0].type if flat else x.type
         ends += [
-            f"    {{ {c_type(kind, 'double')} y = {source.name(n)}; fwrite(&y, sizeof y, 1, stdout); }}" for n in flat
+            f"    {{ {c_type(kind, 'double')} y = {source.name_node(n)}; fwrite(&y, sizeof y, 1, stdout); }}"
+            for n in flat
         ]
         types.append((kind, x.shape))
     lines = [f"static void {name}(void)", "{", *arrays, *source.declarations(), *body, *ends, "}"]

@@ -44,7 +44,7 @@ def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> P
         for argument, fixed in zip(case.arguments, known, strict=False):
             if not fixed:
                 inputs.append(Buffer("input", type_of(argument), argument.shape, lowering.graph.top))
-            columns.append(argument if fixed else StridedArray.whole(inputs[-1]))
+            columns.append(argument if fixed else StridedArray.of_whole_buffer(inputs[-1]))
         rows: list[list[Any]] = []
         with jax.enable_x64(True):
             for run in range(case.runs):
@@ -62,7 +62,7 @@ def _stacked(lowering: Lowering, leaves: Sequence[Any]) -> Any:
     if leaves[0].size:
         return np.stack([lowering.nodes(x) for x in leaves])
     shape = (len(leaves), *leaves[0].shape)
-    return StridedArray.whole(Buffer("scratch", leaves[0].type, shape, lowering.graph.top))
+    return StridedArray.of_whole_buffer(Buffer("scratch", leaves[0].type, shape, lowering.graph.top))
 
 
 def by_known(cases: Sequence[Case], known: Sequence[bool]) -> list[np.ndarray]:

@@ -26,7 +26,7 @@ from heliograph.random_affine.delay import DelayedLink
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
 from heliograph.random_affine.series_and_stack import Stack
-from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded_noises
 
 
 class WordAlphabet(NamedTuple):
@@ -42,7 +42,7 @@ class WordAlphabet(NamedTuple):
 def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
     """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
     m = len(sensor.outputs)
-    rounded = find_rounded(sensor)
+    rounded = find_rounded_noises(sensor)
     if encoder is not None:
         instance("encoder", encoder, Words, "Words").check_outputs(m)
         if rounded:

@@ -39,7 +39,7 @@ from heliograph.random_affine.channel_state_information import (
     condition_on_told_numbers,
     list_told_maps,
     list_told_numbers_of_outputs,
-    make_certain,
+    make_laws_certain,
     numbers_give_law,
 )
 from heliograph.random_affine.moments.second_moments import second_order
@@ -200,10 +200,10 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
-    link = at_each_step(lambda channel: make_certain(separate_told(channel).link), channel)
+    link = at_each_step(lambda channel: make_laws_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
-    if any(affine.reservation for affine in list_told_maps(first(link))):
+    if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
         claim = weakest([claim, "nominal"])
     # Rows of z in which the link's values and the told numbers stand.
     _, values, numbers = separate_told(first(channel))

@@ -19,7 +19,7 @@ class Static(NamedTuple):
     tree: PyTree
     parts: tuple[Hashable, ...]
 
-    def filled(self, numbers: Sequence[jax.Array]) -> PyTree:
+    def with_arrays(self, numbers: Sequence[jax.Array]) -> PyTree:
         """Return the object with these arrays."""
         rest = iter(numbers)
         return self.tree.unflatten([next(rest) if leaf is None else leaf for leaf in self.parts])

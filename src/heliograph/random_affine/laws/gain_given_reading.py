@@ -110,7 +110,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     low = from_gain(jnp.minimum(low, a - 9 * deviation))
     high = from_gain(jnp.maximum(high, a + 9 * deviation))
     # The part of these that does count: within NATS of the mode.
-    mode = _find_mode(log_density, low, high)
+    mode = _find_density_mode(log_density, low, high)
     least = log_density(mode) - NATS
     left, right = _find_density_end(log_density, low, mode, least), _find_density_end(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
@@ -125,7 +125,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
 LogDensity = Callable[[jax.Array], jax.Array]
 
 
-def _find_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
+def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
     """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
     steps = np.linspace(0.0, 1.0, GRID)
 

@@ -29,12 +29,12 @@ class QuadraticMap(Module):
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
         mask = present[:, None] & present[None, :]
-        center = self.middle(second_moment, present)
+        center = self.evaluate_center(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
         unit = jnp.sqrt(_one_unless_positive(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
         return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
 
-    def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+    def evaluate_center(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Return C:W alone, which is all where the law is known."""
         return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 

@@ -288,7 +288,7 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
         return library(means).concatenate(means), _stack_spreads(spreads)
     # Spreads of a sum add up, and that of its noise.
     whole, size = channel.sum_in_places(dict(enumerate(means)), 1), channel.inputs + 1
-    noise = channel.noise.covariance[..., None, None] * _constant_power(size)
+    noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
     spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), 2) + noise
     return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
@@ -332,7 +332,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     every = range(len(parts))  # numbers of the parts
     mean = channel.sum_in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
+    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
     spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     # Known means: nothing is shifted.
@@ -369,6 +369,6 @@ def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, An
     return QuadraticMap(center, channel.sum_in_places({i: part.radius for i, part in parts.items()}, 2))
 
 
-def _constant_power(size: int) -> np.ndarray:
+def _make_power_of_constant(size: int) -> np.ndarray:
     """Return the matrix W = Y Y' of zeros, but 1 as its last entry: that of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])

@@ -148,7 +148,7 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
     rates = items("error rates of hops", hops, "numbers from 0 to 0.5, or Discrete laws of them")
     if not rates:
         raise fail("error rates of hops", "at least one", "none")
-    laws = [_check_rate(rate) for rate in rates]
+    laws = [_read_error_rate(rate) for rate in rates]
     atoms = [law.list_atoms() for law in laws]
     if prod(len(a) for a in atoms) > MOST_ATOMS:
         raise fail("error rates of hops", f"laws of at most {MOST_ATOMS} values together", [len(a) for a in atoms])
@@ -161,7 +161,7 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
     return Flips(error, check_count("words of a message", dimension), flag("per_message", per_message))
 
 
-def _check_rate(rate: object) -> Constant | Discrete:
+def _read_error_rate(rate: object) -> Constant | Discrete:
     """Return the law of a hop's error rate."""
     expected = "one number from 0 to 0.5 for all bits of the word, or a Discrete law of such numbers"
     if isinstance(rate, Discrete):

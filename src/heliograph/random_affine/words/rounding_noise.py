@@ -198,7 +198,7 @@ class RoundedNoise(AbstractNoise):
         return mean[0] * mean[1] + self.covariance[places[0], places[1]]
 
 
-def find_rounded(*models: PyTree) -> Sequence[RoundedNoise]:
+def find_rounded_noises(*models: PyTree) -> Sequence[RoundedNoise]:
     """Return the noises of rounded measurements in these models."""
     leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, RoundedNoise))
     return [leaf for leaf in leaves if isinstance(leaf, RoundedNoise)]

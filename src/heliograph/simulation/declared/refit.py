@@ -22,7 +22,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
-    AbstractMapWithToldNumbers,
+    AbstractToldMap,
     ToldGainHop,
     ToldMap,
     list_told_maps,
@@ -84,7 +84,7 @@ class LinkPlace(NamedTuple):
         outputs: outputs of the sensor that the link carries; None where values are not outputs one by one.
     """
 
-    told: AbstractMapWithToldNumbers
+    told: AbstractToldMap
     numbers: list[int]
     values: list[int]
     outputs: list[int] | None

@@ -196,7 +196,7 @@ def _find_reservations(network: Network) -> Iterator[Doubt]:
         if not isinstance(node, Node) or not node.filters:
             continue
         for affine in list_told_maps(first(node.channel)):
-            if why := affine.reservation:
+            if why := affine.reason_for_no_claim:
                 what = join_names([repr(number) for number in affine.names])
                 yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
 

@@ -122,7 +122,7 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
         """Smooth rows `begin` to `stop` from the last one back; return the estimates after the first."""
-        sweep: BackwardSweep = static.filled(numbers)
+        sweep: BackwardSweep = static.with_arrays(numbers)
         begin, stop = span
         last_row = stop - 1, history.step[stop - 1]
         # How many steps lead from the last row back to row `begin`.

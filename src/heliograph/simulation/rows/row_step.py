@@ -138,7 +138,7 @@ class RowStep:
     @property
     def engine(self) -> str:
         """Return which engine steps the filters, and why."""
-        return self._choice.explained
+        return self._choice.explanation
 
     @property
     def is_native(self) -> bool:
@@ -261,7 +261,7 @@ def _make_step(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.split_row(row))
+        stepped: tuple[PyTree, PyTree] = layout.static.with_arrays(numbers).step(*layout.split_row(row))
         return stepped
 
     return jax.jit(step, inline=True)

@@ -72,7 +72,7 @@ def compile_runs(
         # The refusal is cached; it is raised afresh, so that the cached one holds no traceback.
         raise Unsupported(compiled.operation, compiled.where)
     program, result_tree = compiled
-    return NativeProgram(program.begin([key_words, *arrays, *others], runs), result_tree)
+    return NativeProgram(program.bind_arguments([key_words, *arrays, *others], runs), result_tree)
 
 
 def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: int, precision: Precision) -> None:

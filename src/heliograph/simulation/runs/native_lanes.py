@@ -48,7 +48,7 @@ class NativeLanes:
         def simulate_lane(lane: int) -> list[np.ndarray | None]:
             """Add a lane's runs to its sums; return what is collected of them."""
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.make_zero_sums(self.memory)
-            collected: list[np.ndarray | None] = self.code.begun.add(runs_of_lane[lane], sums)
+            collected: list[np.ndarray | None] = self.code.begun.add_runs(runs_of_lane[lane], sums)
             return collected
 
         collected_by_lane = list(get_thread_pool().map(simulate_lane, used))
