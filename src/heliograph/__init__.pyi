@@ -27,7 +27,7 @@ from .random_affine.laws.fading import (
 from .random_affine.words.bit_flips import (
     decode_and_forward as decode_and_forward,
 )
-from .random_affine.laws.gain_laws import (
+from .random_affine.laws.law import (
     Discrete as Discrete,
 )
 from .random_affine.noise import (

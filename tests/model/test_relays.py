@@ -7,7 +7,7 @@ from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant, Plant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.random_affine.laws.gain_laws import bernoulli
+from heliograph.random_affine.laws.law import bernoulli
 from heliograph.relays.design import given_design, local_error_design, relay_schedules
 from tests.relays.relay_problems import example, unusual
 

@@ -7,7 +7,7 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import AbstractLaw
+from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.testing import check_random_affine
 
 COVARIANCE = np.array([[0.2, 0.05], [0.05, 0.1]])

@@ -7,7 +7,7 @@ from scipy import integrate, optimize
 from scipy import stats as laws
 
 import heliograph as hg
-from heliograph.random_affine.laws.gain_laws import Discrete
+from heliograph.random_affine.laws.law import Discrete
 
 CONTINUOUS = {
     "rayleigh": (hg.Rayleigh(0.7), laws.rayleigh(scale=0.7)),

@@ -9,7 +9,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.fading import LogNormal
-from heliograph.random_affine.laws.gain_laws import GivenMoments, bernoulli
+from heliograph.random_affine.laws.law import GivenMoments, bernoulli
 from heliograph.random_affine.noise import Gaussian
 from tests.oracles import successive_relays as oracle
 

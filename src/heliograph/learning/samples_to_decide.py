@@ -18,7 +18,7 @@ from heliograph.numerics.check import check_count, check_seed, fail, instance, s
 from heliograph.numerics.module import are_same, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.laws.gain_laws import AbstractLaw
+from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo

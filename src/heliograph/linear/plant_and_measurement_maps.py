@@ -13,7 +13,7 @@ from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.pushed_moments import TabulatedNoise
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.random_affine.series_and_stack import Series

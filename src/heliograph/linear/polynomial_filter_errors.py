@@ -27,7 +27,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.monomials import list_exponents, symmetric_power
 from heliograph.random_affine.moments.pushed_moments import (
     TabulatedNoise,

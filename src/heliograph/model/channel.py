@@ -28,7 +28,7 @@ from heliograph.random_affine.delay import (
 )
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant, LawLike
+from heliograph.random_affine.laws.law import AbstractLaw, Constant, LawLike
 from heliograph.random_affine.memories_of_channels import separate_memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput

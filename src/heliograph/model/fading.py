@@ -12,7 +12,7 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.markov_chain_and_autoregression import Autoregression, MarkovChain
 from heliograph.random_affine.memories_of_channels import memories, replace_memories
 from heliograph.random_affine.modes import (

@@ -24,7 +24,7 @@ from heliograph.random_affine.channel_state_information import (
     list_told_maps,
 )
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import AbstractLaw
+from heliograph.random_affine.laws.law import AbstractLaw
 from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise

@@ -16,7 +16,7 @@ from heliograph.planning.problem import DesignProblem, PowerDesign
 from heliograph.planning.transmitters import transmitter_names, visit_hops
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
-from heliograph.random_affine.laws.gain_laws import GivenMoments
+from heliograph.random_affine.laws.law import GivenMoments
 from heliograph.random_affine.moments.signal_path import SignalMoment
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

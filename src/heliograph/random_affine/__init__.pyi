@@ -24,7 +24,7 @@ from .laws.fading import (
     Nakagami as Nakagami,
     Rician as Rician,
 )
-from .laws.gain_laws import (
+from .laws.law import (
     AbstractLaw as AbstractLaw,
     Constant as Constant,
     GivenMoments as GivenMoments,

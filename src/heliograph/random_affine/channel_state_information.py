@@ -21,7 +21,7 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, check_forgets
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
 from heliograph.random_affine.laws.gain_given_reading import gain_given_reading, require_density
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, CertainDiscrete, Constant, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, CertainDiscrete, Constant, Discrete
 from heliograph.random_affine.markov_chain_and_autoregression import (
     AbstractMemory,
     CertainChain,

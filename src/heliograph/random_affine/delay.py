@@ -17,7 +17,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps, replace_inner_maps
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import Discrete
+from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes

@@ -11,7 +11,7 @@ from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant
+from heliograph.random_affine.laws.law import AbstractLaw, Constant
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, disturb_hop, noise_gain
 from heliograph.random_affine.moments.interval_products import Interval
 from heliograph.random_affine.moments.mixture_components import AffineComponent

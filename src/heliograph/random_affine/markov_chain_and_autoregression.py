@@ -31,7 +31,7 @@ from heliograph.numerics.check import (
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, library, within
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.laws.gain_laws import draw_index
+from heliograph.random_affine.laws.law import draw_index
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]

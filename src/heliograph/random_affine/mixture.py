@@ -13,7 +13,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.composite import DIRECT, AbstractOneOfSeveralMaps, write_percentage
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Constant, Discrete
+from heliograph.random_affine.laws.law import Constant, Discrete
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, product_table

@@ -18,7 +18,7 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractOneOfSeveralMaps
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.markov_chain_and_autoregression import (
     AbstractMemory,
     Autoregression,

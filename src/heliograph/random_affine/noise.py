@@ -15,7 +15,7 @@ from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.laws.gain_laws import draw_index
+from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
     GaussianBranches,
     NoiseAtom,

@@ -13,7 +13,7 @@ from heliograph.numerics import check
 from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
 from heliograph.numerics.numpy_or_jax import is_traced, library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.laws.gain_laws import draw_index
+from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector

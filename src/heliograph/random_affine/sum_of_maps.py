@@ -15,7 +15,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise, check_forgets, check_maps
 from heliograph.random_affine.composite import describe_maps_side_by_side
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain
 from heliograph.random_affine.moments.interval_products import Interval

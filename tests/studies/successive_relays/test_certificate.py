@@ -5,7 +5,7 @@ from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
-from heliograph.random_affine.laws.gain_laws import GivenMoments
+from heliograph.random_affine.laws.law import GivenMoments
 from heliograph.relays.design import local_error_design
 from heliograph.relays.design_for_receiver_error import receiver_error_design
 from heliograph_studies.successive_relays.certificate import certify_relays

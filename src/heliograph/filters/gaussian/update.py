@@ -26,7 +26,7 @@ from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Discrete
+from heliograph.random_affine.laws.law import Discrete
 from heliograph.random_affine.moments.moment_tensors import symmetric_product
 from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import (

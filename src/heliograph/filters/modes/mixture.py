@@ -49,7 +49,7 @@ from heliograph.numerics.numpy_or_jax import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.mixture_components import COMPONENT_LIMIT

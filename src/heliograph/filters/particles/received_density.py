@@ -16,7 +16,7 @@ from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.series_and_stack import Series
 

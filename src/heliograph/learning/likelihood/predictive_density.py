@@ -18,7 +18,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, Discrete
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 
 REACH = 5.5  # standard deviations of the normal score: 4e-8 of a law lie beyond

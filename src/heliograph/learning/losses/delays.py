@@ -10,7 +10,7 @@ from heliograph.numerics.check import TINY, array, fail, scalar
 from heliograph.numerics.confidence_intervals import Share, count_independent, wilson
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.laws.gain_laws import Discrete
+from heliograph.random_affine.laws.law import Discrete
 
 DelaysByNode = TypeAliasType("DelaysByNode", Mapping[str, "Delays"])
 

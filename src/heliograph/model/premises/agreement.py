@@ -26,7 +26,7 @@ from heliograph.numerics.numpy_or_jax import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import Constant
+from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise

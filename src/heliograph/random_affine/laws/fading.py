@@ -10,7 +10,7 @@ import scipy
 from heliograph.numerics.check import scalar
 from heliograph.numerics.numpy_or_jax import library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.laws.gain_laws import NATS, AbstractLaw, Scalar, Vector
+from heliograph.random_affine.laws.law import NATS, AbstractLaw, Scalar, Vector
 
 
 class Rayleigh(AbstractLaw):

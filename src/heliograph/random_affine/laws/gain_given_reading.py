@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 
 GAINS, ERRORS = 96, 24  # nodes of a gain, and of the error of its reading
 NODES = 64  # of Gauss-Legendre, over all that matters of the posterior

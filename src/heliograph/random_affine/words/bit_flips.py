@@ -14,7 +14,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.composite import write_percentage
 from heliograph.random_affine.hop import GainAndNoise, known
-from heliograph.random_affine.laws.gain_laws import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.noise import Gaussian
 from heliograph.random_affine.series_and_stack import Series, Stack
