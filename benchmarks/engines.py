@@ -37,8 +37,8 @@ from soak_networks import HORIZON, network
 import heliograph as hg
 from heliograph.engine import choice
 from heliograph.simulation.runs import native as runs
-from straightline import accumulated, compiled
-from straightline.machine import find_processor_features
+from straightline import compiled, sums_over_runs
+from straightline.machine_code import find_processor_features
 
 HERE = Path(__file__).resolve().parent
 DONE, RESULTS = HERE.parent / "out" / "engines.jsonl", HERE / "engines.json"
@@ -63,14 +63,14 @@ def rounded_more(item: hg.Network, index: int) -> Any:
         return (*find_processor_features()[:2], False)
 
     def forget() -> None:
-        for programs in (runs._find_program, choice._compile_structure):
+        for programs in (runs._find_program, choice._compile_for_structure):
             programs.cache_clear()
 
     forget()
     try:
         with (
             patch.object(compiled, "find_processor_features", unfused),
-            patch.object(accumulated, "find_processor_features", unfused),
+            patch.object(sums_over_runs, "find_processor_features", unfused),
         ):
             return simulated(item, index, "native")
     finally:

@@ -1,8 +1,8 @@
 """Time of one covariance step of the quadratic filter: half-vectorised against the full Kronecker square.
 
 Run: python benchmarks/quadratic.py, on one thread (more would hide the operation count). Prints one row per dimension
-of state plus bias. Both forms run the library's own `step_covariance` on the same model; the full one has y (x) y with
-every product twice.
+of state plus bias. Both forms run the library's own `step_covariance_roots` on the same model; the full one has
+y (x) y with every product twice.
 """
 
 import os
@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.roots import covariance_of_root, roots_of
-from heliograph.linear.recursion import RecursionStep, step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, roots_of
+from heliograph.linear.lmmse_recursion import RecursionStep, find_noise_roots, step_covariance_roots
 from heliograph.linear.system import Steps
 from heliograph.random_affine.moments.monomials import position
 
@@ -72,7 +72,7 @@ def seconds(call: Callable[[], object], dimension: int) -> float:
 
 def prepared(step: Steps, covariance: np.ndarray) -> Callable[[], RecursionStep]:
     """The covariance step of this model, whose roots are taken before the clock starts."""
-    return partial(step_covariance, roots_of(covariance), step, take_noise_roots(step, np.diag(covariance)))
+    return partial(step_covariance_roots, roots_of(covariance), step, find_noise_roots(step, np.diag(covariance)))
 
 
 class Row(NamedTuple):

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.relays.design import _propagate, start_moments
+from heliograph.relays.design import _propagate, initial_error_covariance
 from heliograph_studies.successive_relays.setting import Setting
 
 STEPS = 100
@@ -52,7 +52,7 @@ def measure() -> dict[str, Any]:
     hg.relays.local_error_design(network, STEPS)
     first = time.perf_counter() - start
     warm = median_time(lambda: hg.relays.local_error_design(network, STEPS))
-    steps, moments = network.steps(STEPS), start_moments(network)
+    steps, moments = network.steps(STEPS), initial_error_covariance(network)
     recursion = median_time(lambda: _propagate(steps, moments))
     values = {"first call": 1e3 * first, "warm": 1e3 * warm, "recursion, of the warm call": 1e3 * recursion}
     return {"unit": "ms", "values": values, "at_most": {"warm": 1e3 * LIMIT}}
@@ -65,7 +65,7 @@ def main() -> None:
     print("n   design of a step (us)   dense (4 n)^3 product (us)   ratio")
     for n in (3, 6, 12, 24):
         net = of_dimension(n)
-        tables, at_start = net.steps(STEPS), start_moments(net)
+        tables, at_start = net.steps(STEPS), initial_error_covariance(net)
         step = median_time(lambda t=tables, s=at_start: _propagate(t, s), 7) / STEPS
         product = dense(4 * n)
         print(f"{n:<3} {1e6 * step:>10.1f} {1e6 * product:>22.1f} {step / product:>22.1f}")

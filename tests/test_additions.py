@@ -39,8 +39,8 @@ FILTER = {
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns, columns_of, join_columns
-from heliograph.factors.gaussian import from_columns, from_covariance, predict_affine
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, join_columns
+from heliograph.factors.factored_gaussian import from_columns, from_covariance, predict_affine
 from heliograph.filters.base import AbstractSizedFilter, corrects, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Estimate

@@ -11,7 +11,7 @@ from jax import lax
 
 from programs.flow import program
 from programs.writer import Program, Variable
-from straightline.compiled import Compiled
+from straightline.compiled import CompiledFunction
 from straightline.nodes import Unsupported
 from straightline.program import lower_function
 
@@ -90,7 +90,7 @@ def by_native(made: Program, columns: Sequence[np.ndarray], known: Sequence[bool
     data = [c for c, k in zip(columns, known, strict=True) if not k]
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        code = Compiled(lower_function(rest, *(c[0] for c in data)), [True] * len(data))
+        code = CompiledFunction(lower_function(rest, *(c[0] for c in data)), [True] * len(data))
         results: dict[str, np.ndarray] = code(*data)
     return results
 

@@ -9,7 +9,7 @@ __version__ = "0.4.0"
 
 def __getattr__(name: str) -> object:
     """Load a public name; nothing is imported before, so that the command hears Ctrl-C from its first line on."""
-    from heliograph.numerics.names import lazy_names
+    from heliograph.numerics.lazy_exports import lazy_names
 
     here = globals()
     here["__getattr__"], here["__dir__"], here["__all__"] = lazy_names(__name__, __file__)

@@ -24,7 +24,7 @@ from .numerics.check import (
 from .random_affine.laws.fading import (
     Rayleigh as Rayleigh,
 )
-from .random_affine.words.flips import (
+from .random_affine.words.bit_flips import (
     decode_and_forward as decode_and_forward,
 )
 from .random_affine.laws.law import (
@@ -33,7 +33,7 @@ from .random_affine.laws.law import (
 from .random_affine.noise import (
     Gaussian as Gaussian,
 )
-from .random_affine.outliers import (
+from .random_affine.outlier_noise import (
     Contaminated as Contaminated,
     StudentT as StudentT,
 )

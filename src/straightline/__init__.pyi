@@ -5,10 +5,10 @@ from .compiled import (
     compile_one as compile_one,
     explain as explain,
 )
-from .accumulated import (
+from .sums_over_runs import (
     accumulate as accumulate,
 )
-from .rules.present import (
+from .rules.never_nan_marks import (
     present as present,
 )
 from .nodes import (
@@ -17,6 +17,6 @@ from .nodes import (
 from .c_function import (
     to_c as to_c,
 )
-from .rules.named import (
+from .rules.custom_operations import (
     operation as operation,
 )

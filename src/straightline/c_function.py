@@ -38,12 +38,12 @@ class CArray(NamedTuple):
     symmetric: bool = False
 
     @property
-    def argument(self) -> str:
+    def argument_declaration(self) -> str:
         """Return the declaration as what a function reads."""
         return f"const {self.type} {self.name}[{max(self.size, 1)}]" if self.is_array else f"{self.type} {self.name}"
 
     @property
-    def result(self) -> str:
+    def result_declaration(self) -> str:
         """Return the declaration as what a function writes."""
         return f"{self.type} {self.name}[{max(self.size, 1)}]"
 
@@ -165,7 +165,7 @@ def _make_entry_expression(array: CArray) -> Place:
 def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequence[Sequence[Node]]) -> list[str]:
     """Return the lines that write every result, `flat` its nodes; a flag is written as a byte."""
     return [
-        f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name(node)};"
+        f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name_node(node)};"
         for x, nodes in zip(results, flat, strict=True)
         for i, node in enumerate(nodes)
     ]
@@ -173,7 +173,7 @@ def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequenc
 
 def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
     """Return the head of the function."""
-    every = [*(x.argument for x in arguments), *(x.result for x in results)]
+    every = [*(x.argument_declaration for x in arguments), *(x.result_declaration for x in results)]
     line = f"void {name}({', '.join(every)})"
     return line if len(line) <= 100 else f"void {name}(\n    " + ",\n    ".join(every) + ")"
 

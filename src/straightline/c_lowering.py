@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.folding import is_finite
+from straightline.constant_folding import is_finite
 from straightline.graph import Graph
-from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, Value, arrange_nodes, type_of
-from straightline.memory import InMemory
 from straightline.nodes import REAL, Buffer, Node, Type
+from straightline.size_limits import LOADED
+from straightline.strided_arrays import StridedArray
 
 # Finite where the arguments are, but for overflow and divisions by zero.
 PRESERVING = frozenset((
@@ -71,7 +71,7 @@ class CLowering(Lowering):
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Lower one operation; arithmetic is written out unless its arrays are too long."""
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
-            inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LOADED else x for x in inputs]
+            inputs = [self.nodes(x) if isinstance(x, StridedArray) and x.size <= LOADED else x for x in inputs]
         return super().lower_equation(equation, inputs)
 
     def make_known_array(self, number: Any) -> Value:
@@ -81,7 +81,7 @@ class CLowering(Lowering):
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         array = np.asarray(number)
-        return InMemory.whole(Buffer("table", type_of(array), array.shape, self.graph.top, array))
+        return StridedArray.of_whole_buffer(Buffer("table", type_of(array), array.shape, self.graph.top, array))
 
 
 def lower_for_c(
@@ -105,7 +105,7 @@ def lower_for_c(
         buffers.append(buffer)
         if number in finite:
             graph.finite_buffers.add(buffer)
-        value: Any = InMemory.whole(buffer)
+        value: Any = StridedArray.of_whole_buffer(buffer)
         if number in symmetric:  # entries (i, j) and (j, i) are one node, that of the upper triangle
             nodes, n = value.nodes(graph), aval.shape[0]
             value = arrange_nodes([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)

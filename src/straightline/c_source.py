@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type, Unsupported
-from straightline.program import list_needed
+from straightline.program import list_needed_items
 
 Real = Literal["double", "float"]
 
@@ -194,14 +194,14 @@ class CSource:
         `real` is the type of numbers, and `prefix` begins the tables' names.
         """
         self.places, self.real, self.prefix = places, real, prefix
-        self.needed = list_needed(roots)
+        self.needed = list_needed_items(roots)
         self.names: dict[Node, str] = {}  # variable of each node that is computed
         self.arrays: dict[Buffer, str] = {}  # local array of each buffer that is filled
         self.tables: dict[tuple[str, bytes], tuple[str, str]] = {}  # name and definition, by type and numbers
         self.operations: dict[str, int] = {}  # how many of each
         self.count = 0  # of variables
 
-    def name(self, node: Node) -> str:
+    def name_node(self, node: Node) -> str:
         """Return the variable or literal of a number."""
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
@@ -211,7 +211,7 @@ class CSource:
         A limit that float does not have limits no float, and `write_literal` would refuse it.
         """
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
-            return self.name(node)
+            return self.name_node(node)
         largest = float(np.finfo(np.float32).max)
         return write_literal(
             min(max(node.value, -largest), largest) if node.type == "f64" else node.value, node.type, self.real
@@ -232,11 +232,11 @@ class CSource:
                 lines += self._write_guard(statement, indent)
             elif isinstance(statement, Store):
                 entry = self._write_entry(statement.buffer, statement.offset, statement.strides, statement.indices)
-                lines.append(f"{indent}{entry} = {self.name(statement.node)};")
+                lines.append(f"{indent}{entry} = {self.name_node(statement.node)};")
             else:
                 condition = statement.loop.condition
                 assert condition is not None  # only a loop that ends by its condition has a check
-                lines.append(f"{indent}if (!{self.name(condition)}) break;")
+                lines.append(f"{indent}if (!{self.name_node(condition)}) break;")
         return lines
 
     def declarations(self, indent: str = "    ") -> list[str]:
@@ -261,7 +261,7 @@ class CSource:
             buffer, offset, strides = node.value
             text = self._write_entry(buffer, offset, strides, node.args)
         else:
-            named = self._clip_to_range if node.op in ("min", "max") else self.name
+            named = self._clip_to_range if node.op in ("min", "max") else self.name_node
             text = write_expression(node, [named(a) for a in node.args], self.real)
             self.operations[node.op] = self.operations.get(node.op, 0) + 1
         self.names[node] = self._new_name()
@@ -279,7 +279,9 @@ class CSource:
 
     def _write_index(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
         """Return the expression offset + sum strides * indices."""
-        terms = [f"{s} * {self.name(i)}" if s != 1 else self.name(i) for s, i in zip(strides, indices, strict=True)]
+        terms = [
+            f"{s} * {self.name_node(i)}" if s != 1 else self.name_node(i) for s, i in zip(strides, indices, strict=True)
+        ]
         return " + ".join(([str(offset)] if offset or not terms else []) + terms)
 
     def _name_table(self, buffer: Buffer) -> str:
@@ -305,7 +307,7 @@ class CSource:
         carried = [k for k, node in enumerate(loop.parameters) if {node, loop.results[k]} & self.needed.keys()]
         for k in carried:
             name, start = self._new_name(), loop.initial[k]
-            lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name(start)};")
+            lines.append(f"{indent}{c_type(start.type, self.real)} {name} = {self.name_node(start)};")
             self.names[loop.parameters[k]] = self.names[loop.results[k]] = name
         lines += [f"{indent}{self._write_loop_head(loop)}", *self.write_statements(loop.body, deeper)]
         # The next turn's values are assigned at the end, all at once: a value that is itself a carried variable is
@@ -313,10 +315,10 @@ class CSource:
         next_values: list[str] = []
         for k in carried:
             node = loop.following[k]
-            value = self.name(node)
+            value = self.name_node(node)
             if node.op == "parameter":  # of this loop or of one around it
                 value = self._new_name()
-                lines.append(f"{deeper}const {c_type(node.type, self.real)} {value} = {self.name(node)};")
+                lines.append(f"{deeper}const {c_type(node.type, self.real)} {value} = {self.name_node(node)};")
             next_values.append(value)
         for k, value in zip(carried, next_values, strict=True):
             lines.append(f"{deeper}{self.names[loop.parameters[k]]} = {value};")
@@ -339,8 +341,8 @@ class CSource:
             self.names[outcome] = self._new_name()
             lines.append(f"{indent}{c_type(outcome.type, self.real)} {self.names[outcome]} = 0;")
         deeper = f"{indent}    "
-        lines += [f"{indent}if ({self.name(guard.condition)}) {{", *self.write_statements(guard.body, deeper)]
-        return [*lines, *(f"{deeper}{self.names[r]} = {self.name(v)};" for r, v in results), f"{indent}}}"]
+        lines += [f"{indent}if ({self.name_node(guard.condition)}) {{", *self.write_statements(guard.body, deeper)]
+        return [*lines, *(f"{deeper}{self.names[r]} = {self.name_node(v)};" for r, v in results), f"{indent}}}"]
 
 
 def _wrap_numbers(numbers: Sequence[str]) -> list[str]:

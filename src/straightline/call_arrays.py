@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from straightline.llvm.layout import LINE
-from straightline.result_memory import align_to_line
+from straightline.llvm.memory_layout import LINE
+from straightline.result_memory import align_to_cache_line
 
 
 def convert_to_memory(x: Any, dtype: Any) -> np.ndarray:
@@ -29,4 +29,4 @@ def list_addresses(arrays: Sequence[np.ndarray]) -> list[int]:
 
 def allocate_aligned(size: int) -> np.ndarray:
     """Return so many bytes of zero, at an address that is a multiple of a cache line."""
-    return align_to_line(np.zeros(size + LINE, np.uint8))
+    return align_to_cache_line(np.zeros(size + LINE, np.uint8))

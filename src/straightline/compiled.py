@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import PyTree
 
 from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
-from straightline.folding import DTYPES
-from straightline.limits import ALONE, LITTLE, LONGEST
-from straightline.llvm.module import ModuleText, write_module
-from straightline.machine import Machine, TieredCode, choose_hasty_width, find_processor_features, generate
+from straightline.constant_folding import DTYPES
+from straightline.llvm.module_text import ModuleText, write_module
+from straightline.machine_code import MachineCode, TieredCode, choose_hasty_width, emit_code, find_processor_features
 from straightline.nodes import Unsupported
 from straightline.program import Program, lower_function
 from straightline.result_memory import make_aligned_array
+from straightline.size_limits import ALONE, LITTLE, LONGEST
 
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
 
-class Compiled:
+class CompiledFunction:
     """Code for blocks of runs, one for each number of a vector; of `width` runs, or of as many as suit the processor.
 
     `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
@@ -54,7 +54,7 @@ class Compiled:
         self._by_run = self.differs.index(True) if True in self.differs else None
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
-    def with_first(self, *arguments: PyTree) -> "Compiled":
+    def with_first_arguments(self, *arguments: PyTree) -> "CompiledFunction":
         """Return the same code whose first arguments are these, which calls leave out."""
         new = copy(self)
         new._first = [convert_to_memory(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
@@ -62,7 +62,7 @@ class Compiled:
         new._addresses, new._shared = list_addresses(new._first), None
         return new
 
-    def for_runs(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
+    def make_in_place_code(self, runs: int, inputs: Mapping[int, np.ndarray] = MappingProxyType({})) -> "InPlaceCode":
         """Return the same code for so many runs at a time, with memory of its own: no call of it makes an array.
 
         Args:
@@ -72,21 +72,21 @@ class Compiled:
         """
         return InPlaceCode(self, runs, inputs)
 
-    def prepare(self, arrays: Sequence[Any] = ()) -> str:
+    def generate_code(self, arrays: Sequence[Any] = ()) -> str:
         """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
         if self._refusal is None:
             try:
                 if self.once is not None:
-                    self.once.prepare(1)
+                    self.once.generate_code(1)
                 if not all(self.code.common):
-                    tiers, width = self._choose_tiers(self._count_runs(arrays))
-                    tiers.prepare(-(-self._count_runs(arrays) // width))
+                    tiers, width = self._choose_code_and_width(self._count_runs(arrays))
+                    tiers.generate_code(-(-self._count_runs(arrays) // width))
                 self._refusal = ""
             except Unsupported as error:
                 self._refusal = str(error)
         return self._refusal
 
-    def _choose_tiers(self, runs: int) -> tuple[TieredCode, int]:
+    def _choose_code_and_width(self, runs: int) -> tuple[TieredCode, int]:
         """Return the code for so many runs, and the most runs of its vectors: one run fills no lanes."""
         return (self.single, 1) if runs == 1 else (self.blocks, self.width)
 
@@ -134,12 +134,12 @@ class Compiled:
         if all(code.common):
             return jax.tree.unflatten(self.tree, outputs)
         # What differs between runs, block by block: each call computes its own rows of the outputs.
-        tiers, width = self._choose_tiers(sum(counts))
+        tiers, width = self._choose_code_and_width(sum(counts))
         machine, begin = tiers.choose_machine(-(-sum(counts) // width)), 0
         for call_arrays, count in zip(arrays, counts, strict=True):
             rows = [x[begin : begin + count] for x in outputs]
-            pointers, memory = self._point_to(call_arrays, rows, shared), (call_arrays, code.tables, rows, shared)
-            self._compute_blocks(CallMemory(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
+            pointers, memory = self._list_addresses(call_arrays, rows, shared), (call_arrays, code.tables, rows, shared)
+            self._compute_blocks(MemoryOfCall(machine=machine, pointers=pointers, memory=memory, runs=count), cores)
             begin += count
         return jax.tree.unflatten(self.tree, outputs)
 
@@ -153,18 +153,18 @@ class Compiled:
         shared = self._shared
         if shared is None:
             shared = allocate_aligned(self.code.shared)
-            pointers = self._point_to(arrays, outputs, shared)
+            pointers = self._list_addresses(arrays, outputs, shared)
             self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
             self._shared = shared if all(self.differs[len(self._first) :]) else None
-        self._copy_common(outputs, shared)
+        self._copy_shared_outputs(outputs, shared)
         return shared
 
-    def _point_to(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
+    def _list_addresses(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
         """Return addresses in the order that the code expects: inputs, tables, outputs, what runs share."""
         own = list_addresses(arrays[len(self._first) :])
         return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
-    def _compute_blocks(self, call: "CallMemory", cores: int | None) -> None:
+    def _compute_blocks(self, call: "MemoryOfCall", cores: int | None) -> None:
         """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
         blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
         # Blocks of a thread's part: an even share, but no less than is worth a thread. -(-a // b) is a / b rounded up.
@@ -175,7 +175,7 @@ class Compiled:
         starts = range(0, blocks, share)
         list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
-    def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
+    def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         """Copy the outputs that all runs share from where they were computed, to every run."""
         parts = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
         for array, is_common, offset, buffer in parts:
@@ -184,13 +184,13 @@ class Compiled:
                 array[...] = shared[offset : offset + size].view(array.dtype).reshape(buffer.shape)
 
 
-class CallMemory(NamedTuple):
+class MemoryOfCall(NamedTuple):
     """Code and all the memory of one call, held by each thread that computes a part of it.
 
     Who waits for the parts may stop waiting, at a Ctrl-C for example: the threads go on to write.
     """
 
-    machine: Machine
+    machine: MachineCode
     pointers: np.ndarray
     memory: Any
     runs: int
@@ -202,13 +202,13 @@ class CallMemory(NamedTuple):
 
 
 class InPlaceCode:
-    """Code of a `Compiled` for so many runs, in arrays of its own: a call computes `outputs` from `inputs`.
+    """Code of a `CompiledFunction` for so many runs, in arrays of its own: a call computes `outputs` from `inputs`.
 
     What all runs share, but the first arguments, which calls leave out, is computed in every call. Bits are those of
     any number of runs.
     """
 
-    def __init__(self, compiled: Compiled, runs: int, inputs: Mapping[int, np.ndarray]):
+    def __init__(self, compiled: CompiledFunction, runs: int, inputs: Mapping[int, np.ndarray]):
         """Make the arrays of calls; `inputs` has those that are read in place, by the number of the argument."""
         code, left_out, self.runs = compiled.code, len(compiled._first), runs
         self._compiled, differs = compiled, compiled.differs[left_out:]
@@ -220,7 +220,7 @@ class InPlaceCode:
         self._scratch, self._is_common = allocate_aligned(code.scratch), all(code.common)
         self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
         # The code for so many runs, and whether a call is so little work that threads would cost more.
-        self._tiers, width = compiled._choose_tiers(runs)
+        self._tiers, width = compiled._choose_code_and_width(runs)
         self._blocks = -(-runs // width)
         self._is_little = runs == 1 or self._blocks * code.blocks.work < LITTLE
         # What all runs share is computed now, unless it follows from an argument of the calls.
@@ -256,13 +256,13 @@ class InPlaceCode:
         if self._is_little:
             machine.run(*self._addresses, 0, -(-self.runs // machine.width), self.runs)
         else:
-            call = CallMemory(machine=machine, pointers=self._pointers, memory=self._memory, runs=self.runs)
+            call = MemoryOfCall(machine=machine, pointers=self._pointers, memory=self._memory, runs=self.runs)
             self._compiled._compute_blocks(call, cores=None)
 
     def _compute_shared(self, once: TieredCode) -> None:
         """Compute what all runs share, and copy the shared results to every run's."""
         once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)
-        self._compiled._copy_common(self.outputs, self._memory[-1])
+        self._compiled._copy_shared_outputs(self.outputs, self._memory[-1])
 
 
 class SingleRunCode:
@@ -275,11 +275,11 @@ class SingleRunCode:
         every, (_name, _flags, fuses) = [True] * len(program.inputs), find_processor_features()
         self.code = write_module(program, differing=every, width=1, fuse=fuses, alone=True, last=in_place)
         level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long
-        self.machine, self.tree, self._in_place = generate(self.code.blocks, level, 1), program.tree, in_place
+        self.machine, self.tree, self._in_place = emit_code(self.code.blocks, level, 1), program.tree, in_place
         self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
         self._allocate_memory([])
 
-    def again(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
+    def with_new_memory(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
         """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
         new = copy(self)
         new._allocate_memory(first)
@@ -309,7 +309,7 @@ def compile(
     shared: Sequence[int] = (),
     most: int | None = None,
     single: bool = False,
-) -> Compiled:
+) -> CompiledFunction:
     """Compile a JAX function of one run's arrays for many runs, in double precision or in single.
 
     The result is called with arrays that have a leading axis of runs, and returns NumPy arrays that have one too. Runs
@@ -330,7 +330,7 @@ def compile(
     """
     find_processor_features()  # refuses a processor that LLVM does not know
     differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
-    return Compiled(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
+    return CompiledFunction(lower_function(function, *examples, most=most or 2 * LONGEST, single=single), differs)
 
 
 def compile_one(
@@ -381,7 +381,7 @@ def explain(
     return describe_counts(code)
 
 
-def describe_counts(code: Compiled) -> str:
+def describe_counts(code: CompiledFunction) -> str:
     """Return in words how many operations a run takes."""
     return f"{code.operations} operations{f', {code.divisions} of them divisions and roots' if code.divisions else ''}"
 

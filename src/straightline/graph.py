@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from straightline.folding import COMMUTATIVE, DTYPES, fold_node
-from straightline.limits import LONGEST
+from straightline.constant_folding import COMMUTATIVE, DTYPES, fold_node
 from straightline.nodes import REAL, Block, Buffer, Node, Number, Store, Type, Unsupported
+from straightline.size_limits import LONGEST
 
 
 class Graph:
@@ -41,10 +41,10 @@ class Graph:
         key = (type, value if value != 0 or type not in REAL else str(value))  # 0.0 == -0.0, but they differ
         known = self.top.seen.get(key)
         if known is None:
-            known = self.top.seen[key] = self.fresh("constant", type, (), self.top, value)
+            known = self.top.seen[key] = self.make_fresh_node("constant", type, (), self.top, value)
         return known
 
-    def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
+    def make_fresh_node(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
         """Make a node that equals no other, and that no block contains yet."""
         self.serial += 1
         if self.serial > self.max_nodes:
@@ -52,7 +52,7 @@ class Graph:
         return Node(op, type, args, block, value, self.serial)
 
     @contextmanager
-    def at_most(self, count: int) -> Iterator[None]:
+    def limit_new_nodes(self, count: int) -> Iterator[None]:
         """Allow so many more nodes; if there are more, which is refused, the block that was open is open again."""
         before, block = self.max_nodes, self.current
         self.max_nodes = min(before, self.serial + count)
@@ -100,6 +100,6 @@ class Graph:
             depth = max(depth, *[a.block.depth for a in args], 0)
             while block.depth > depth and not block.pinned and block.parent is not None:
                 block = block.parent
-        made = block.seen[key] = self.fresh(op, type, args, block, value)
+        made = block.seen[key] = self.make_fresh_node(op, type, args, block, value)
         block.items.append(made)
         return made

@@ -1,7 +1,7 @@
 """Lowering of a traced function of one run to a graph of scalar operations.
 
 An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations only move
-references; or, if it is long, `InMemory`. `RULES` has a rule for each operation of JAX, from the files of rules.
+references; or, if it is long, `StridedArray`. `RULES` has a rule for each operation of JAX, from the files of rules.
 """
 
 import os
@@ -19,9 +19,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jaxtyping import PyTree
 
 from straightline.graph import Graph
-from straightline.limits import LONGEST, TABLE, WRITTEN_OUT
-from straightline.memory import InMemory
 from straightline.nodes import TYPES, Buffer, Node, RandomKey, Type, Unsupported
+from straightline.size_limits import LONGEST, TABLE, WRITTEN_OUT
+from straightline.strided_arrays import StridedArray
 
 Value = Any  # a NumPy array of nodes or keys, or an array in memory
 Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
@@ -52,9 +52,9 @@ class Lowering:
         values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.make_known_array, consts), strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
         for equation in _list_used_equations(jaxpr):
-            arguments = [self._look_up(values, v) for v in equation.invars]
+            arguments = [self._look_up_argument(values, v) for v in equation.invars]
             values |= zip(equation.outvars, self.lower_equation(equation, arguments), strict=True)
-        return [self._look_up(values, v) for v in jaxpr.outvars]
+        return [self._look_up_argument(values, v) for v in jaxpr.outvars]
 
     def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
         """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
@@ -62,9 +62,9 @@ class Lowering:
         values = self.inline_program(program, inputs)
         return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
 
-    def _make_empty_view(self, aval: Any) -> InMemory:
+    def _make_empty_view(self, aval: Any) -> StridedArray:
         """Return an array without entries, in memory of its type and shape."""
-        return InMemory.whole(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
+        return StridedArray.of_whole_buffer(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Return the results of one operation.
@@ -87,7 +87,7 @@ class Lowering:
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
         """Apply the rule of an operation: in memory if an input is there, else on its entries."""
-        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
+        if name in IN_MEMORY and (name not in RULES or any(isinstance(x, StridedArray) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:
             raise Unsupported(name)
@@ -95,7 +95,7 @@ class Lowering:
 
     def nodes(self, value: Value) -> np.ndarray:
         """Return a value as a NumPy array of nodes."""
-        return value.nodes(self.graph) if isinstance(value, InMemory) else value
+        return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
         """Return the node of a value without axes."""
@@ -114,10 +114,10 @@ class Lowering:
         array = np.asarray(number)
         type = type_of(array)
         if array.size > TABLE:
-            return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
+            return StridedArray.of_whole_buffer(Buffer("table", type, array.shape, self.graph.top, array))
         return arrange_nodes([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
 
-    def _look_up(self, values: dict[Var, Value], v: Any) -> Value:
+    def _look_up_argument(self, values: dict[Var, Value], v: Any) -> Value:
         """Return the value of an operation's argument: a literal's constant, else what was computed."""
         return self.make_known_array(_convert_literal(v.val, v)) if isinstance(v, Literal) else values[v]
 
@@ -135,7 +135,7 @@ def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
 
 
 @contextmanager
-def refuse_failures(what: str) -> Iterator[None]:
+def turn_failures_into_refusals(what: str) -> Iterator[None]:
     """Turn a failure of what makes native code into a refusal."""
     try:
         yield

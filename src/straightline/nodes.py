@@ -112,7 +112,7 @@ class Buffer:
         self.parts: list[Buffer] = []
         self.first: list[int] = []
 
-    def take_in(self, inner: "Buffer", start: int) -> None:
+    def place_buffer_inside(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""
         inner.inside = self, start
         self.parts.append(inner)

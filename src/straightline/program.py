@@ -1,7 +1,8 @@
 """Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
 
 Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, W the
-most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning (`fold_rows`).
+most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning
+(`fold_rows_into_batches`).
 """
 
 from collections import defaultdict
@@ -15,29 +16,29 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
-from straightline.folding import DTYPES
+from straightline.constant_folding import DTYPES
 from straightline.graph import Graph
-from straightline.limits import LONGEST, TABLE
 from straightline.lowering import Lowering, Value, arrange_nodes, make_keys, trace_function, type_of
-from straightline.memory import InMemory
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, Node, Store
 from straightline.rules import (  # noqa: F401  (they fill the rules)
-    calls,
+    calls_and_branches,
+    custom_operations,
     decompositions,
     elementwise,
-    indexing,
+    gather,
+    long_arrays,
     loops,
     matrices,
-    named,
-    present,
+    never_nan_marks,
     random_bits,
-    rows,
     scatter,
     shapes,
     sorting,
-    special,
+    special_functions,
     views,
 )
+from straightline.size_limits import LONGEST, TABLE
+from straightline.strided_arrays import StridedArray
 
 
 class Program(NamedTuple):
@@ -93,7 +94,7 @@ def lower_traced(
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
         shape = (*aval.shape, 2) if is_key else aval.shape  # a key is two words
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
-        view = InMemory.whole(buffer)
+        view = StridedArray.of_whole_buffer(buffer)
         inputs.append(buffer)
         if number in known:
             mask, numbers = known[number]
@@ -105,7 +106,7 @@ def lower_traced(
     return Program(graph=lowering.graph, inputs=inputs, outputs=outputs, tree=tree)
 
 
-def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, numbers: np.ndarray) -> Value:
+def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarray, numbers: np.ndarray) -> Value:
     """Return an argument with constants where `mask` says that its numbers are known; a long one stays in memory."""
     if mask.all():
         return lowering.make_known_array(numbers.astype(DTYPES[view.type]))
@@ -117,7 +118,7 @@ def _insert_known_entries(lowering: Lowering, view: InMemory, mask: np.ndarray, 
     return arrange_nodes(nodes, view.shape)
 
 
-def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
+def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
     """Return the nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
@@ -125,14 +126,14 @@ def list_needed(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
         node = waiting.pop()
         if node not in results:
             results[node] = None
-            waiting += node.args if is_plain(node) else _list_needs(node)
+            waiting += node.args if needs_arguments_alone(node) else _list_needs(node)
     return results
 
 
 REFERRING = frozenset(("load", "parameter", "result", "counter", "guarded"))  # nodes that need more than arguments
 
 
-def is_plain(node: Any) -> bool:
+def needs_arguments_alone(node: Any) -> bool:
     """Return whether all that an item of a program needs is its arguments: an operation outside of loops and guards."""
     return type(node) is Node and node.block.parent is None and node.op not in REFERRING
 
@@ -213,11 +214,11 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
     return []
 
 
-def sort_items(items: Iterable[Any]) -> list[Any]:
+def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
     """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
 
     def position(x: Any) -> int:
-        """Return the serial of the number after which an item stands, -1 for the beginning."""
+        """Return the serial of the number after which an item stands; -1, the beginning, if it depends on none."""
         if isinstance(x, Store):
             return x.node.serial
         if isinstance(x, Loop | Guard):
@@ -227,7 +228,7 @@ def sort_items(items: Iterable[Any]) -> list[Any]:
     return sorted(items, key=position)
 
 
-def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
+def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
 
     The input buffers are among them. What differs is spread step by step, from each item to those that are computed
@@ -250,7 +251,7 @@ def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     # For each item, those that differ if it does.
     followers: defaultdict[Any, list[Any]] = defaultdict(list)
     for item in items:
-        for source in item.args if is_plain(item) else _list_sources(item, list_owners):
+        for source in item.args if needs_arguments_alone(item) else _list_sources(item, list_owners):
             followers[source].append(item)
         if isinstance(item, Store):  # a number that differs makes the memory differ that it is stored in
             followers[item].append(item.buffer.owner[0])
@@ -265,19 +266,19 @@ def find_varying(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
     return differing
 
 
-def find_differing(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
+def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return what of these items, in order, differs between runs: what varies with these inputs, and some memory more.
 
     What runs share is computed once, before them. Of an array that a loop carries in memory the numbers of the last
     turn are left then: where runs need those of every turn, each has an array of its own.
     """
-    differing = find_varying(items, inputs)
+    differing = find_varying_items(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
     # Carried memory that runs read within the loop joins what differs, and what follows from it, until none is left.
     while read_in_turns := (
         carried and _find_memory_read_in_parts(find_crossing_items(items, differing)) & carried - differing
     ):
-        differing = find_varying(items, [*inputs, *read_in_turns, *(carried & differing)])
+        differing = find_varying_items(items, [*inputs, *read_in_turns, *(carried & differing)])
     return differing
 
 
@@ -341,13 +342,13 @@ class SummedOutputs(NamedTuple):
     number: int
 
 
-def row_length(width: int, batches: int) -> int:
+def row_length_of_sums(width: int, batches: int) -> int:
     """Return the length of a row of sums."""
     return batches + width - 1
 
 
-def fold_rows(sums: np.ndarray, batches: int) -> np.ndarray:
-    """Return sums (..., batch) from rows (..., `row_length`)."""
+def fold_rows_into_batches(sums: np.ndarray, batches: int) -> np.ndarray:
+    """Return sums (..., batch) from rows (..., `row_length_of_sums`)."""
     totals = sums[..., :batches].copy()
     for start in range(batches, sums.shape[-1], batches):
         beyond = sums[..., start : start + batches]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from straightline.llvm.layout import LINE
+from straightline.llvm.memory_layout import LINE
 
 LEAST = 1 << 17  # bytes of an array below which the library of C has memory at hand
 MOST = 1 << 28  # bytes that a process keeps: what was kept first goes back to the system
@@ -21,8 +21,8 @@ ARRAYS = 64  # that it keeps
 _kept: dict[int, np.ndarray] = {}  # by identity, oldest first; a single operation of a dict needs no lock
 
 
-class _Loan:
-    """Bytes below an array: NumPy holds this object for the array and its views, and drops it with the last of them."""
+class _LoanedBytes:
+    """Kept bytes lent to an array: NumPy holds this object for it and its views, and drops it with the last one."""
 
     def __init__(self, memory: np.ndarray):
         self._memory = memory
@@ -37,12 +37,12 @@ class _Loan:
 def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_Loan(_take_memory(size + LINE)))
-    numbers: np.ndarray = align_to_line(memory)[:size].view(dtype)
+    memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_LoanedBytes(_take_memory(size + LINE)))
+    numbers: np.ndarray = align_to_cache_line(memory)[:size].view(dtype)
     return numbers.reshape(shape)
 
 
-def align_to_line(memory: np.ndarray) -> np.ndarray:
+def align_to_cache_line(memory: np.ndarray) -> np.ndarray:
     """Return all but a line of some bytes, from the first one on that begins a line."""
     start = -memory.ctypes.data % LINE
     return memory[start : start + len(memory) - LINE]

@@ -4,6 +4,6 @@
 What all of them are made of stands here; figures are in `curves`.
 """
 
-from heliograph.numerics.names import lazy_names
+from heliograph.numerics.lazy_exports import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

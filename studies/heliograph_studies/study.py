@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import heliograph
-from heliograph.numerics.process.extras import check_installed
+from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.report.pages.page import KeyFigures, Page, Section, Table
 from heliograph.report.progress import Advance, progress
 from heliograph.report.results import Results, write_results

@@ -7,9 +7,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.engine.choice import engine_of
-from straightline import machine
-from straightline.compiled import Compiled, SingleRunCode, compile
-from straightline.jax_function import make_jax_function
+from straightline import machine_code
+from straightline.compiled import CompiledFunction, SingleRunCode, compile
+from straightline.graph_as_jax_function import make_jax_function
 from straightline.program import lower_function
 
 RANDOM = np.random.default_rng(4)
@@ -72,7 +72,7 @@ def test_every_filter_gives_what_xla_gives(name):
         expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
         by_jax = jax.jit(jax.vmap(make_jax_function(program)))(z)
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
-    for mean, covariance in (Compiled(program, [True])(z), map(np.asarray, by_jax)):
+    for mean, covariance in (CompiledFunction(program, [True])(z), map(np.asarray, by_jax)):
         assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
         assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
 
@@ -97,9 +97,9 @@ def test_bits_depend_on_no_width_and_no_neighbour(name):
     item = FILTERS[name]()
     single, z = over_recording(item), measurements(item, 13, 20)
     program = lower_function(single, z[0])
-    whole = Compiled(program, [True], 8)(z, cores=3)
+    whole = CompiledFunction(program, [True], 8)(z, cores=3)
     for width in (4, 16):
-        for a, b in zip(whole, Compiled(lower_function(single, z[0]), [True], width)(z, cores=1), strict=True):
+        for a, b in zip(whole, CompiledFunction(lower_function(single, z[0]), [True], width)(z, cores=1), strict=True):
             np.testing.assert_array_equal(a, b)
     alone = SingleRunCode(lower_function(single, z[0]))
     for run in (0, 12):
@@ -372,8 +372,8 @@ def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypa
         raise RuntimeError("no target for this processor")
 
     x = RANDOM.normal(size=(3, 2, 2))
-    monkeypatch.setattr(machine.llvm.Target, "from_default_triple", unknown)
-    for cached in (machine.find_llvm_target, machine.find_processor_features):
+    monkeypatch.setattr(machine_code.llvm.Target, "from_default_triple", unknown)
+    for cached in (machine_code.find_llvm_target, machine_code.find_processor_features):
         cached.cache_clear()
     with pytest.warns(RuntimeWarning, match="no native code: expected a processor that LLVM knows, got no target"):
         assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"

@@ -83,7 +83,7 @@ def test_xla_computes_where_llvm_makes_no_code_which_is_said_once(compute, monke
         raise RuntimeError(f"LLVM ERROR: out of registers in {compute.__name__}")
 
     with monkeypatch.context() as patch:
-        patch.setattr("straightline.machine.Machine", fails)
+        patch.setattr("straightline.machine_code.MachineCode", fails)
         with pytest.warns(RuntimeWarning) as said:
             values = compute()
     assert ["LLVM ERROR" in str(x.message) and "no native code" in str(x.message) for x in said] == [True]

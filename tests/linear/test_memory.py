@@ -3,7 +3,7 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
+from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, scalar_system, two_sensors
 

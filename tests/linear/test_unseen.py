@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.linear.known_losses import find_eigenspaces, find_fastest_unobserved_mode, is_excited_by_noise
+from heliograph.linear.known_loss_stability import find_fastest_unobserved_mode, is_excited_by_noise, list_eigenspaces
 
 NONE = np.zeros((0, 2))
 INDEPENDENT = np.array([[0.3, 0.7]] * 2)
@@ -47,11 +47,11 @@ def test_units_do_not_decide(scale):
 
 
 def test_eigenspaces_of_a_rotation_and_of_a_double_eigenvalue():
-    ((value, space),) = find_eigenspaces(np.array([[0.0, -2.0], [2.0, 0.0]]))
+    ((value, space),) = list_eigenspaces(np.array([[0.0, -2.0], [2.0, 0.0]]))
     assert abs(value - 2j) < 1e-12 and space.shape == (2, 1)
-    ((_, whole),) = find_eigenspaces(np.eye(3))
+    ((_, whole),) = list_eigenspaces(np.eye(3))
     assert whole.shape == (3, 3)
-    ((_, jordan),) = find_eigenspaces(np.array([[1.0, 1.0], [0.0, 1.0]]))
+    ((_, jordan),) = list_eigenspaces(np.array([[1.0, 1.0], [0.0, 1.0]]))
     np.testing.assert_allclose(np.abs(jordan.ravel()), (1, 0), atol=1e-7)
 
 

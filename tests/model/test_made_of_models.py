@@ -13,7 +13,7 @@ import heliograph as hg
 from heliograph.model.over_time import at
 from heliograph.model.plant import JointNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 PAGE = Path(__file__).parents[2] / "docs" / "names.md"
 KINDS = (

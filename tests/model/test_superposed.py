@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.sum_of_maps import Superposed
 
 HOP = hg.hop(1.0, 0.1)
 LATE = hg.model.delayed(HOP, hg.Discrete([0, 1], [0.5, 0.5]), timestamped=True)

@@ -5,8 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.moments import ChannelPosition, SignalMoment
+from heliograph.random_affine.series_and_stack import Series
 
 HOP = hg.hop(hg.Rayleigh(0.8), 0.1)
 RELAYED = hg.amplify_and_forward([HOP, hg.erasure(hg.hop(1.0, 0.2), 0.9)])

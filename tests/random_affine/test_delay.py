@@ -75,7 +75,9 @@ REFUSED = {
     "delayed link: expected one that is not late": lambda: delayed(delayed(LINK, 1), 1),
     "delay: expected a number of steps": lambda: delayed(LINK, 0.5),
     "delay: expected a whole number": lambda: delayed(LINK, hg.Discrete([0.5, 1.0], [0.5, 0.5])),
-    "expected one that forgets, got Delayed": lambda: hg.amplify_and_forward([delayed(LINK, CHAIN), delayed(LINK, 1)]),
+    "expected one that forgets, got DelayedLink": lambda: hg.amplify_and_forward(
+        [delayed(LINK, CHAIN), delayed(LINK, 1)]
+    ),
     "output, such as perfect.1., got one that takes 2": lambda: hg.linear_filter(
         hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0), delayed(hg.hop(1, 1, dimension=2), 1)
     ),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.testing import check_random_affine
 
 Autoregression, Faded, Modes, Series, Stack, joint_modes = (

@@ -4,7 +4,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments import list_exponents
-from heliograph.random_affine.noise import noise_vector
+from heliograph.random_affine.noise import noise_moment_vector
 
 COVARIANCE = np.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.8]])
 
@@ -15,7 +15,7 @@ def test_gaussian_moments_are_gauss_hermite_quadrature():
     grid = np.array(np.meshgrid(nodes, nodes, nodes)).reshape(3, -1)
     weight = np.prod(np.array(np.meshgrid(weights, weights, weights)).reshape(3, -1), axis=0) / (2 * np.pi) ** 1.5
     points = noise.mean[:, None] + np.linalg.cholesky(COVARIANCE) @ grid
-    for (*powers, _), value in zip(list_exponents(4, 4), noise_vector(noise, 4), strict=True):
+    for (*powers, _), value in zip(list_exponents(4, 4), noise_moment_vector(noise, 4), strict=True):
         quadrature = weight @ np.prod(points ** np.array(powers)[:, None], axis=0)
         assert value == pytest.approx(quadrature, abs=1e-12)
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 import llvmlite.binding as llvm
 import numpy as np
 
-from straightline.llvm.lanes import write_types
-from straightline.vectors.elementary import write_functions
+from straightline.llvm.vector_types_and_gathers import write_vector_types
+from straightline.vectors.elementary_functions import write_elementary_functions
 
 WIDTH = 8
 
@@ -18,7 +18,9 @@ class Compiled:
     def __init__(self, names: Iterable[str], single: bool = False):
         self.single = single
         names = [f"{name}f" if single else name for name in names]
-        self.engine = engine_of(write_functions(names, WIDTH) + "".join(_loop(name, single) for name in names))
+        self.engine = engine_of(
+            write_elementary_functions(names, WIDTH) + "".join(_loop(name, single) for name in names)
+        )
 
     def __call__(self, name: str, *arguments: np.ndarray) -> np.ndarray:
         """The function's results."""
@@ -40,7 +42,7 @@ def engine_of(text: str) -> llvm.ExecutionEngine:
     target = llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=1
     )
-    module = llvm.parse_assembly(write_types(WIDTH) + text)
+    module = llvm.parse_assembly(write_vector_types(WIDTH) + text)
     module.verify()
     engine = llvm.create_mcjit_compiler(module, target)
     engine.finalize_object()

@@ -8,7 +8,7 @@ import pytest
 from straightline.graph import Graph
 from straightline.lowering import Lowering, list_nodes, trace_function
 from straightline.nodes import Unsupported
-from straightline.program import list_needed, lower_function
+from straightline.program import list_needed_items, lower_function
 from tests.straightline.over_runs import over_runs
 
 
@@ -79,13 +79,13 @@ def test_factors_and_triangular_systems():
 
 def test_equal_expressions_are_one_node_and_what_nothing_needs_is_dropped():
     program = lower_function(lambda x: (x[0] * x[1] + x[1] * x[0], jnp.sin(x[2]))[0], np.zeros(3))
-    nodes = list_needed(list_nodes(program.outputs[0]))
+    nodes = list_needed_items(list_nodes(program.outputs[0]))
     assert sorted(n.op for n in nodes if hasattr(n, "op")) == ["add", "load", "load", "mul"]
 
 
 def test_a_product_with_zero_is_zero_only_of_finite_numbers():
     graph = Graph()
-    zero, data = graph.constant(0.0, "f64"), graph.fresh("load", "f64", (), graph.top, None)
+    zero, data = graph.constant(0.0, "f64"), graph.make_fresh_node("load", "f64", (), graph.top, None)
     flag = graph.node("gt", "bool", data, zero)
     assert graph.node("mul", "f64", zero, data).op == "mul"
     assert graph.node("mul", "f64", zero, graph.node("convert", "f64", flag)) is zero

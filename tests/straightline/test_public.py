@@ -69,7 +69,7 @@ def test_one_run_is_computed_in_place():
         code()
         code()
         assert x.tolist() == [1.5, 3.0] and y.tolist() == [1.0, 2.0]
-        other = code.again([])
+        other = code.with_new_memory([])
         other()
         assert other.inputs[0].tolist() == [0.0, 0.0] and x.tolist() == [1.5, 3.0]
 

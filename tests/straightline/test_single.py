@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import straightline
-from straightline.compiled import Compiled
+from straightline.compiled import CompiledFunction
 from straightline.program import lower_function
 
 EPS = 2.0**-23  # of float32
@@ -78,7 +78,9 @@ def test_bits_depend_on_no_neighbour_nor_on_the_width_or_the_cores():
     one = straightline.compile(lambda x, k: step(x, k)[0], x[0], k[0], single=True)
     whole = one(x, k)
     for width in (1, 8, 32):
-        other = Compiled(lower_function(lambda x, k: step(x, k)[0], x[0], k[0], single=True), [True, True], width)
+        other = CompiledFunction(
+            lower_function(lambda x, k: step(x, k)[0], x[0], k[0], single=True), [True, True], width
+        )
         np.testing.assert_array_equal(other(x, k), whole)
     np.testing.assert_array_equal(one(x[13:15], k[13:15], cores=1), whole[13:15])
 

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from heliograph.files.network_file import load_function
-from heliograph.numerics.keys import seed_key
 from heliograph.numerics.module import readable
+from heliograph.numerics.random_keys import seed_key
 from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")

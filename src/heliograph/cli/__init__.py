@@ -10,4 +10,4 @@ from heliograph.cli.stopping import INTERRUPTED as INTERRUPTED
 from heliograph.cli.stopping import SIGNALLED as SIGNALLED
 from heliograph.cli.stopping import TERMINATED as TERMINATED
 from heliograph.cli.stopping import GentleStop as GentleStop
-from heliograph.numerics.process.extras import EXTRAS as EXTRAS
+from heliograph.numerics.process.optional_packages import EXTRAS as EXTRAS

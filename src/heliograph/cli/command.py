@@ -23,7 +23,7 @@ from heliograph.cli.serve import serve
 from heliograph.cli.stopping import INTERRUPTED, SIGNALLED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
-from heliograph.numerics.process.extras import EXTRAS, MissingPackagesError, how_to_install
+from heliograph.numerics.process.optional_packages import EXTRAS, MissingPackagesError, how_to_install
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2

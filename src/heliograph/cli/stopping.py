@@ -9,7 +9,7 @@ from threading import Timer
 from types import FrameType, TracebackType
 from typing import NoReturn, TypeVar
 
-from heliograph.numerics.process.signals import STOPPING, handle_stop_signals
+from heliograph.numerics.process.stop_signals import STOPPING, handle_stop_signals
 
 SIGNALLED = 128  # plus the signal's number: the exit code of what a signal ended
 INTERRUPTED, TERMINATED = SIGNALLED + signal.SIGINT, SIGNALLED + signal.SIGTERM

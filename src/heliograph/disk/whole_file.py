@@ -10,7 +10,7 @@ from glob import escape as glob_escape
 from pathlib import Path
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.process.signals import hold_signals
+from heliograph.numerics.process.stop_signals import hold_signals
 
 try:
     import fcntl

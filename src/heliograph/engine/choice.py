@@ -12,13 +12,13 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from heliograph.engine.limits import SHORT
+from heliograph.engine.size_thresholds import SHORT
 from heliograph.numerics import float64
 from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.process.garbage_collector import pause_collector
 from heliograph.numerics.process.interpreter_stack import reserve_stack
 from heliograph.numerics.trace_settings import trace_settings
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, compile
 
@@ -37,7 +37,7 @@ def get_thread_pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1)
 
 
-class Choice(NamedTuple):
+class EngineChoice(NamedTuple):
     """Code of a function, or the reason why XLA computes it; `arrays` are those of its arguments and of its closure."""
 
     code: Any  # what `straightline.compile` returns
@@ -45,7 +45,7 @@ class Choice(NamedTuple):
     arrays: tuple[Any, ...] = ()
 
     @property
-    def explained(self) -> str:
+    def explanation(self) -> str:
         """Sentence "native: ..." with the number of operations, or "xla: ..." with the reason."""
         if self.code is None:
             return f"xla: {self.why}"
@@ -72,20 +72,20 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explained
+    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explanation
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """Return why native code does not take a function of these arguments, "" if it does or if XLA is forced."""
-    if read_setting() == "xla":
+    if read_forced_engine() == "xla":
         return ""
     with jax.enable_x64(True):
-        return _find_code(function, arguments, [False] * len(arguments)).why
+        return _find_compiled_code(function, arguments, [False] * len(arguments)).why
 
 
 def choose_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
-) -> Choice:
+) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
     Args:
@@ -97,13 +97,13 @@ def choose_code(
     Raises:
         ValueError: native code is forced and does not take the program.
     """
-    engine = read_setting()
+    engine = read_forced_engine()
     if engine == "xla":
-        return Choice(code=None, why=f"{SETTING} is set to it")
-    choice = _find_code(function, arguments, differs, None if engine == "native" else most)
+        return EngineChoice(code=None, why=f"{SETTING} is set to it")
+    choice = _find_compiled_code(function, arguments, differs, None if engine == "native" else most)
     # LLVM may refuse what was lowered: only an attempt shows it.
-    if choice.code is not None and (why := choice.code.prepare(choice.arrays)):
-        choice = Choice(code=None, why=why)
+    if choice.code is not None and (why := choice.code.generate_code(choice.arrays)):
+        choice = EngineChoice(code=None, why=why)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
@@ -174,7 +174,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
     return program
 
 
-def read_setting() -> str:
+def read_forced_engine() -> str:
     """Return the forced engine, "" if none is."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
@@ -182,9 +182,9 @@ def read_setting() -> str:
     return engine
 
 
-def try_native(make: Callable[[], Code]) -> Code | None:
+def make_native_or_none(make: Callable[[], Code]) -> Code | None:
     """Return the native code that `make` makes, or None if XLA has to compute instead."""
-    engine = read_setting()
+    engine = read_forced_engine()
     if engine == "xla":
         return None
     try:
@@ -196,9 +196,9 @@ def try_native(make: Callable[[], Code]) -> Code | None:
         return None
 
 
-def _find_code(
+def _find_compiled_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
-) -> Choice:
+) -> EngineChoice:
     """Return the native code of a function for arguments of this structure, compiled once, or why there is none.
 
     Args:
@@ -223,13 +223,15 @@ def _find_code(
         else:
             key_leaves.append(leaf)
     try:
-        code, why = _compile_structure(structure, tuple(key_leaves), most)
+        code, why = _compile_for_structure(structure, tuple(key_leaves), most)
     except TypeError as error:  # a leaf without a hash has no key: XLA computes
         is_of_key = "unhashable" in str(error)  # rather than one that the function raises while it is traced
         if not is_of_key:
             raise
-        return Choice(code=None, why=f"the function holds an object that cannot be compared with another: {error}")
-    return Choice(code=code, why=why, arrays=tuple(arrays))
+        return EngineChoice(
+            code=None, why=f"the function holds an object that cannot be compared with another: {error}"
+        )
+    return EngineChoice(code=code, why=why, arrays=tuple(arrays))
 
 
 class _ArrayOfRun(NamedTuple):
@@ -243,7 +245,7 @@ class _ArrayOfRun(NamedTuple):
 @lru_cache(COMPILED)
 @reserve_stack
 @pause_collector()
-def _compile_structure(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
+def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | None) -> tuple[Any, str]:
     """Return the code of a function in a tree (function, *arguments) with these leaves, or None and why there is none.
 
     Of arrays the leaves have shapes and types: these are the arguments of the code.

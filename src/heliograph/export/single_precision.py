@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from heliograph.factors.two_part_mean import SplitMeanGaussian
+from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.over_time import first
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -7,8 +7,8 @@ its mean beside the center; here it becomes a mean on the group, and its covaria
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.numerics.manifold import Manifold
 
 
@@ -20,7 +20,7 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
 
     Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3 (the reset).
     """
-    reset = manifold.reset(x.mean - center) if manifold.rotations else None
+    reset = manifold.reset_jacobian(x.mean - center) if manifold.rotations else None
     if reset is None:
         return x
     return from_columns(manifold.settle(center, x.mean), WeightedColumns(reset @ x.root, x.variances))
@@ -34,6 +34,6 @@ def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     if not manifold.rotations:
         return x
     mean = manifold.unsettle(center, x.mean)
-    reset = manifold.reset(mean - center)
+    reset = manifold.reset_jacobian(mean - center)
     assert reset is not None
     return from_columns(mean, WeightedColumns(jnp.linalg.inv(reset) @ x.root, x.variances))

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from heliograph.factors.columns import is_positive, reciprocal_or_one
-from heliograph.factors.repeated import noise_beside_rounding, rounding_of_products
+from heliograph.factors.covariance_factors import is_positive, reciprocal_or_one
+from heliograph.factors.repeated_measurements import noise_beside_rounding, rounding_of_products
 from heliograph.numerics.linalg import WRITTEN
 from heliograph.numerics.trace_settings import writes_short_programs
 
 
-def measure_scalar(
+def update_by_scalar(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Update the rows V of a root and its variances d by one scalar measurement f' xi + v; return V, d, gain K and s.
@@ -27,20 +27,20 @@ def measure_scalar(
     since L is lower.
     """
     product = d * f
-    return measure_scalar_given_products(root, d, f, (product, f * product), noise)
+    return update_by_scalar_given_products(root, d, f, (product, f * product), noise)
 
 
-def measure_scalar_given_products(
+def update_by_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `measure_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
+    """Measure f' xi + v as `update_by_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
     product, power = products
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
-    after, kept, w = update_columns(root, d, product, f, s)
+    after, kept, w = update_root_columns(root, d, product, f, s)
     return after, kept, w * reciprocal_or_one(s[0]), s[0]
 
 
-def update_columns(
+def update_root_columns(
     root: jax.Array, d: jax.Array, product: jax.Array, f: jax.Array, s: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return V_j - (f_j / s_{j+1}) w_{j+1}, d_j s_{j+1} / s_j and w_0, with w_j = sum_{k >= j} product_k V_k."""
@@ -58,7 +58,7 @@ def update_columns(
     return after, kept, lax.index_in_dim(w, 0, axis=1, keepdims=False)
 
 
-def measure_parts(
+def update_by_parts(
     measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]],
     root: jax.Array,
     d: jax.Array,
@@ -73,7 +73,7 @@ def measure_parts(
             variances given the part, and its gain (rows,).
         root: rows (rows, columns) of x, and below them those of the n parts.
         d: variances (columns,).
-        least: variance (n,) up to which a part's slopes are rounding (`carry_rounding`).
+        least: variance (n,) up to which a part's slopes are rounding (`propagate_slope_rounding`).
 
     Returns:
         Rows, variances, and gains (rows, n), a column for each part.
@@ -87,19 +87,19 @@ def measure_parts(
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
-            return root, d, carry_rounding(least, gain[first_part:], least[i]), gains
+            return root, d, propagate_slope_rounding(least, gain[first_part:], least[i]), gains
 
         no_gains = jnp.zeros((len(root), n), root.dtype)
         root, d, _, all_gains = lax.fori_loop(0, n, measure_next, (root, d, least, no_gains))
         return root, d, all_gains
     for i in range(n):
         root, d, gain = measure_part(i, root, d, least[i])
-        least = carry_rounding(least, gain[first_part:], least[i])
+        least = propagate_slope_rounding(least, gain[first_part:], least[i])
         gains.append(lax.expand_dims(gain, (1,)))
     return root, d, lax.concatenate(gains, 1)
 
 
-def carry_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> jax.Array:
+def propagate_slope_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> jax.Array:
     """Return the rounding (m,) of the slopes of parts from which a measured one is taken, times its gain (m,).
 
     Slopes become f_j - gain_j f_i: what rounding left of f_i, of a variance `measured`, is in those of all others.
@@ -107,20 +107,20 @@ def carry_rounding(least: jax.Array, gain: jax.Array, measured: jax.Array) -> ja
     return least + gain**2 * measured
 
 
-def measure_row(
+def update_by_row(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `measure_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
+    """Measure f' xi + v as `update_by_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
 
     They are measured with a noise beside which they are nothing to the last digit.
     """
     product = d * f
     power = f * product
     if least is None:
-        return measure_scalar_given_products(root, d, f, (product, power), noise)
+        return update_by_scalar_given_products(root, d, f, (product, power), noise)
     nothing = jnp.sum(power) <= least
     beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
-    root, d, gain, total = measure_scalar_given_products(root, d, f, (product, power), beside)
+    root, d, gain, total = update_by_scalar_given_products(root, d, f, (product, power), beside)
     return root, d, gain, jnp.where(nothing, noise, total)
 
 
@@ -128,7 +128,7 @@ Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 
 
-def measure_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
+def update_by_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
     """Measure the rows below the n of a state, one by one: rows, variances, news, innovations and their variances.
 
     Args:
@@ -138,28 +138,28 @@ def measure_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.A
         variance: of the components' noises (m,).
         least: variance (m,) up to which slopes are rounding.
     """
-    measure = _measure_in_turns if writes_short_programs() and len(variance) > 1 else _measure_one_by_one
+    measure = _update_by_rows_in_loop if writes_short_programs() and len(variance) > 1 else _update_by_rows_one_by_one
     return measure(root, d, news, variance, least)
 
 
-def _measure_one_by_one(
+def _update_by_rows_one_by_one(
     root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
 ) -> Measured:
-    """Write `measure_rows` out, row after row."""
+    """Write `update_by_rows` out, row after row."""
     n, values, totals = len(d), list[jax.Array](), list[jax.Array]()
     for i in range(len(variance)):
-        root, d, gain, total = measure_row(root, d, root[n + i], variance[i], least[i] if i else None)
+        root, d, gain, total = update_by_row(root, d, root[n + i], variance[i], least[i] if i else None)
         values.append(-news[n + i])
         totals.append(total)
         news = news + gain * values[i]
-        least = carry_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
+        least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
     return root, d, news, _stack_numbers(values), _stack_numbers(totals)
 
 
-def _measure_in_turns(
+def _update_by_rows_in_loop(
     root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
 ) -> Measured:
-    """Compute `measure_rows` in a loop, which is a shorter program than `_measure_one_by_one`.
+    """Compute `update_by_rows` in a loop, which is a shorter program than `_update_by_rows_one_by_one`.
 
     Each turn measures the row behind the n ones of the state and then moves it behind all others, so that the next row
     to measure has the same place in every turn, and after the last one all are in their order again.
@@ -169,11 +169,11 @@ def _measure_in_turns(
     def measure_next(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
         """Measure the row of this noise; return what is next, and its innovation with the variance."""
         root, d, news, least = carry
-        rows, d, gain, variance_of_row = measure_row(root, d, root[n], noise, least[0])
+        rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, least[0])
         innovation = -news[n]
         # Of the first row, marked by -1, the rounding is that of its own products.
         rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
-        least = carry_rounding(least, gain[n:], rounding)
+        least = propagate_slope_rounding(least, gain[n:], rounding)
         news = news + gain * innovation
         carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, 0)
         return carry, (innovation, variance_of_row)

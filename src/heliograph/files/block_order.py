@@ -8,8 +8,8 @@ from heliograph.files.table import TIME
 from heliograph.files.table_rows import RowsAsColumns
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.row_order import SECOND, YEAR
 from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
+from heliograph.numerics.times.timestamp_order import SECOND, YEAR
 from heliograph.simulation.network import Network
 
 

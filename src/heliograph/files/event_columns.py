@@ -13,7 +13,7 @@ from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
 from heliograph.model.checks.refusals import Reason, RefusedError
 from heliograph.numerics.check import fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_unset_stamps
+from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_unset_stamps
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

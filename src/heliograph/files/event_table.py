@@ -26,7 +26,7 @@ from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.row_order import SECOND
+from heliograph.numerics.times.timestamp_order import SECOND
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.network import Network
 

@@ -16,7 +16,7 @@ from heliograph.files.table_writer import open_table
 from heliograph.files.text.dialects import check_distinct
 from heliograph.files.text.text_file import Progress, kind_of
 from heliograph.numerics.check import fail, file_path, show_value, table
-from heliograph.numerics.masked import fill_masked, is_absent
+from heliograph.numerics.masked_arrays import fill_masked, is_absent
 from heliograph.numerics.process.plugins import FORMATS as FORMATS_OF_OTHERS
 from heliograph.numerics.process.plugins import find_plugin
 from heliograph.numerics.times.dates import looks_like_date, parse_dates

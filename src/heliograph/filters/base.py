@@ -26,8 +26,8 @@ from heliograph.model.premises.premise import NOTHING, Premise, StaticPremise, b
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.lazy_exports import refuse_attribute
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.names import refuse_attribute
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = ["AbstractFilter", "AbstractSizedFilter", "FilterAngles", "Step", "believes", "check_step_number",

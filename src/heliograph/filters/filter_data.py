@@ -20,7 +20,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.data_rows import check_rows
+from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis

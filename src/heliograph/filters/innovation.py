@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.counted_shares import Share, count_independent, round_to, wilson
+from heliograph.numerics.confidence_intervals import Share, count_independent, round_to, wilson
 from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float

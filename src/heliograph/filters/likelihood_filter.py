@@ -12,7 +12,7 @@ from heliograph.model.sensor import AnySensor, check_sensor
 from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.check import fail, flag, instance
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 
 def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:

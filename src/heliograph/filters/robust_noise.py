@@ -12,13 +12,13 @@ from heliograph.model.over_time import OverTime, at_each_step
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Independent
-from heliograph.random_affine.outliers import (
+from heliograph.random_affine.outlier_noise import (
     StudentT,
 )
 

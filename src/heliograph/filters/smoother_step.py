@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
-from heliograph.factors.gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
+from heliograph.factors.factored_gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.factors.gaussian_on_group import settle, unsettle
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
@@ -143,7 +143,7 @@ class SmootherStep(Module):
         change = self.manifold.unsettle(before.ahead, self.after.mean) - before.ahead
         after = after._replace(mean=point.mean + after.through(change[:, None])[:, 0])
         # Of attitudes: errors about the mean after the step, in place of changes from that before the measurement.
-        reset = self.manifold.reset(change)
+        reset = self.manifold.reset_jacobian(change)
         if reset is None:
             return after
         return after._replace(link=after.through(jnp.linalg.inv(reset)), lower=jnp.zeros_like(after.lower))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.numerics.types import Array, Bool, PyTree
 
 TOLERANCE = 1e-11  # of a deviation, between two states that should be the same

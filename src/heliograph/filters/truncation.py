@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, impose_moments_of_combination
+from heliograph.factors.factored_gaussian import Gaussian, impose_moments_of_combination
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 
 PlacedLimits = tuple[tuple[int, float, float], ...]  # place, lowest and highest value of each limited component

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
-from heliograph.factors.gaussian import from_covariance
+from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
-from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
-from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
+from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import signal_of
@@ -30,7 +30,7 @@ from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 BLOCK = 128  # plants side by side under XLA
 

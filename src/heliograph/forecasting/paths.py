@@ -21,7 +21,7 @@ from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Bool
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 DRAWS = 10_000
 

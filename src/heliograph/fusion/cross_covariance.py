@@ -18,7 +18,7 @@ import numpy as np
 from heliograph.filters.linear.plan import LinearStep
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float
 
 SAME = 1e-13  # relative difference of two numbers that are the same but for the rounding of a few products

@@ -13,9 +13,9 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail, rank
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Numbers = TypeAliasType("Numbers", Float[Array, "*n"])

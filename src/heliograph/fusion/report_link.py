@@ -14,9 +14,9 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import array, check_count, fail, instance, probabilities, rank
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.module import Module, are_same, readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 

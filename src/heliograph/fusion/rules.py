@@ -29,7 +29,7 @@ from heliograph.numerics.check import (
     items,
     probabilities,
 )
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Array, ArrayLike, Float
 

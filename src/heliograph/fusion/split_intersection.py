@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import rounding_of_variances
+from heliograph.factors.covariance_factors import rounding_of_variances
 from heliograph.fusion.joint_covariance_weights import matrix_weights, weigh_covariance
 from heliograph.fusion.rules import AbstractIntersection, Covariances, Fused, Means
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank

@@ -8,7 +8,7 @@ from heliograph.fusion.quantizer import AbstractQuantizer, Parameter, Quantized,
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 

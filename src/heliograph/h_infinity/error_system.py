@@ -11,7 +11,7 @@ from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fa
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import check_maps
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain
 
 LARGEST = 1e100  # of levels, gains and weights: products of three of them are numbers
 ROUNDING = 1e-13  # relative to the largest eigenvalue, in units of each component: smaller ones are rounding

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from heliograph.numerics.traced import called_program
+from heliograph.numerics.numpy_or_jax import called_program
 
 Numbers = np.ndarray
 Contraction = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Sequence[int]]]  # contracted, batch

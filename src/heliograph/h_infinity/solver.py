@@ -19,7 +19,7 @@ from heliograph.h_infinity.step_inequality import (
     make_linear_forms,
 )
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.extras import how_to_install
+from heliograph.numerics.process.optional_packages import how_to_install
 from heliograph.numerics.types import Float
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.learning.intervals import Method
 from heliograph.learning.likelihood_maximum import Solution
 from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph.numerics.process.extras import check_installed
+from heliograph.numerics.process.optional_packages import check_installed
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr

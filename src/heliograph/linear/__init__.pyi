@@ -4,20 +4,20 @@ from .steady_state import (
     CriticalArrival as CriticalArrival,
     critical_arrival as critical_arrival,
 )
-from .polynomial import (
+from .polynomial_filter_errors import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,
 )
 from .jump_system import (
     JumpSystem as JumpSystem,
 )
-from .lift import (
+from .monomial_lifted_system import (
     lifted_system as lifted_system,
 )
-from .modal import (
+from .mode_switching_system import (
     modal_system as modal_system,
 )
-from .recursion import (
+from .lmmse_recursion import (
     lmmse as lmmse,
     true_covariance as true_covariance,
 )

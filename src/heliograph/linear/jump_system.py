@@ -17,13 +17,13 @@ import numpy as np
 
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, Int
 
 Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a first axis
 
 
-def mix_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
+def mix_moments_of_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
     """Return Y_j = sum_i T_ij X_i."""
     *axes, modes, n, _ = moments.shape
     sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
@@ -59,7 +59,7 @@ class JumpSystem(NamedTuple):
 
     def step(self, moments: Float[Array, "*axes _ n n"]) -> Any:
         """Propagate X over one step, without an axis of time; or over each step from an X before it of its own."""
-        return propagate_by_mode(self.maps, mix_modes(self.chain, moments), self.added)
+        return propagate_by_mode(self.maps, mix_moments_of_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
         """Propagate X from before the first step: X after each step."""
@@ -77,7 +77,9 @@ class JumpSystem(NamedTuple):
 
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix of X -> X over all steps, without noise, on the entries of upper triangles."""
-        return np.asarray(make_entry_matrix(self._replace(added=0.0 * self.added)._propagate_one_period, self.shape))
+        return np.asarray(
+            make_matrix_on_triangle_entries(self._replace(added=0.0 * self.added)._propagate_one_period, self.shape)
+        )
 
     def radius(self) -> float:
         """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
@@ -85,6 +87,7 @@ class JumpSystem(NamedTuple):
 
     def steady(self) -> Any:
         """Solve for X (time, M, n, n) after each of steps that repeat for ever, of a radius below 1."""
+        # X after a period is a linear map of X before it, and what comes from no X: both are equal where it is steady.
         start = solve_fixed_point(
             self._replace(added=0.0 * self.added)._propagate_one_period,
             self._propagate_one_period(np.zeros(self.shape)),
@@ -108,7 +111,7 @@ class JumpSystem(NamedTuple):
             derivatives = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 derivatives.append(weight + later)
-                later = mix_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivatives[-1], 0.0))
+                later = mix_moments_of_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivatives[-1], 0.0))
             return later[..., :modes_before, :, :], derivatives[::-1]
 
         later = np.zeros((modes_before, n, n))
@@ -127,27 +130,32 @@ class JumpSystem(NamedTuple):
         return last if moments.shape[-3] == last.shape[-3] else last.sum(axis=-3, keepdims=True)
 
 
-def make_entry_matrix(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
+def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
     """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
-    _, where, basis = _place_in_triangles(shape)
+    _, where, basis = _place_in_upper_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
-    matrix, where = make_entry_matrix(linear, constant.shape), _place_in_triangles(constant.shape)[1]
+    matrix, where = (
+        make_matrix_on_triangle_entries(linear, constant.shape),
+        _place_in_upper_triangles(constant.shape)[1],
+    )
     solution = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[where])
-    return unpack_entries(solution, constant.shape)
+    return unpack_triangle_entries(solution, constant.shape)
 
 
-def unpack_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
+def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
     """Return symmetric matrices with these entries in their upper triangles."""
-    return entries[_place_in_triangles(shape)[0]]
+    return entries[_place_in_upper_triangles(shape)[0]]
 
 
 @lru_cache(8)
-def _place_in_triangles(shape: tuple[int, ...]) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
+def _place_in_upper_triangles(
+    shape: tuple[int, ...],
+) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
     """Return each matrix entry's place among those of the upper triangles, where these are, and unit matrices of each.
 
     A unit matrix has one of these entries, and its mirror image, at 1 and all else at zero.

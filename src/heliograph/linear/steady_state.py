@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
-from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
-from heliograph.linear.recursion import step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
+from heliograph.linear.known_loss_stability import BELOW_ONE, KnownLossSystem, certify_radius, find_gains
+from heliograph.linear.lmmse_recursion import find_noise_roots, step_covariance_roots
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
@@ -176,19 +176,19 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     try:
         prior = solve_discrete_are(a.T, c.T, q, r)
     except (LinAlgError, ValueError) as error:
-        raise _refuse_no_steady_state(str(error)) from None
+        raise _make_no_steady_state_error(str(error)) from None
     # One more correction and prediction gives the gain, and must come back to where it began.
-    noises = take_noise_roots(step, np.diag(prior))
+    noises = find_noise_roots(step, np.diag(prior))
     gain, root = observe_root(roots_of(prior), c, noises.received)
-    again = covariance_of_root(step_covariance(root, step, noises).predicted)
+    again = covariance_of_root(step_covariance_roots(root, step, noises).predicted)
     unit = standard_deviations(prior)
     moved = np.abs(again - prior) / (unit[:, None] * unit)
     if not np.all(np.isfinite(prior)) or np.max(moved) > CLOSE or spectral_radius(a - a @ gain @ c) >= 1:
-        raise _refuse_no_steady_state("none that is approached")
+        raise _make_no_steady_state_error("none that is approached")
     return SteadyState((prior + prior.T) / 2, covariance_of_root(root), gain)
 
 
-def _refuse_no_steady_state(got: str) -> Exception:
+def _make_no_steady_state_error(got: str) -> Exception:
     """Make the ValueError of a plant and sensor without a steady state."""
     expected = "unstable modes that the sensor sees, and noise in all those on the unit circle"
     return fail("steady state", expected, " ".join(got.split()).rstrip("."))

@@ -112,7 +112,7 @@ class LinearSystem(Module):
         return max(changes)
 
 
-def repeat_last(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
+def repeat_last_step(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     """Return the parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
     values = np.array(parts)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
@@ -125,7 +125,7 @@ def _rounding_or_zero(given: ArrayLike | None, shape: tuple[int, ...]) -> np.nda
 
 
 class StateMoments(NamedTuple):
-    """Mean and covariance of y itself; entry 0 is the start."""
+    """Mean and covariance of the state y before any data, at each time; entry 0 is the start."""
 
     mean: Float[np.ndarray, "time+1 N"]
     covariance: Float[np.ndarray, "time+1 N N"]
@@ -223,7 +223,7 @@ class Schedule(Module):
             (time, q, q), (time, q, q), (time, m, m),
         )  # fmt: skip
         named = zip(Gains._fields, gains, shapes, strict=True)
-        self.gains = Gains(*((_fill_unknown if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
+        self.gains = Gains(*((_array_or_nan if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
         if not isinstance(claim, str) or claim not in STRENGTH:
@@ -241,7 +241,7 @@ class Schedule(Module):
             np.savez(file, start=self.start, claim=np.array(self.claim), **self.gains._asdict())
 
 
-def _fill_unknown(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _array_or_nan(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of the given shape, NaN where it is not known."""
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)

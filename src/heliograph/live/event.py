@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from heliograph.numerics.check import fail, is_whole, show_value
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
-from heliograph.engine.choice import read_setting, try_native
+from heliograph.engine.choice import make_native_or_none, read_forced_engine
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.stored.old_layout import split_by_path
@@ -25,7 +25,7 @@ from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.caching import share_by_object
 from heliograph.numerics.float64 import understood
 from heliograph.numerics.trees.program_text import hash_numbers, write_program_text
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
 
@@ -42,7 +42,7 @@ class NativeFilterStepper:
 
         The code reads and writes the same arrays at each call: here they get names.
         """
-        self._code = code.again(numbers)
+        self._code = code.with_new_memory(numbers)
         # Arguments (numbers, state, z, u, k); results (judgement, flagged, state after, estimate, next state). Of both
         # the state's leaves are n.
         arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
@@ -153,7 +153,7 @@ def _judge_step(
         u: inputs (inputs,).
         k: step number.
     """
-    filter: AbstractFilter = static.filled(numbers)
+    filter: AbstractFilter = static.with_arrays(numbers)
     after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     # NaN in z did not arrive; infinite measurements and inputs that are no numbers are refused.
     unusable = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
@@ -188,7 +188,7 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
     """
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_setting())
+    return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_forced_engine())
 
 
 @lru_cache
@@ -227,7 +227,7 @@ def _compile_step(
         in_place = {i - state_count: number_count + i for i in range(state_count)}
         return compile_one(step, *(np.zeros(shape, kind) for shape, kind in shapes), in_place=in_place)
 
-    return try_native(compile_code)
+    return make_native_or_none(compile_code)
 
 
 class DecidingSender(NamedTuple):

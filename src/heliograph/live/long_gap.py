@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.factors.columns import unit_lower
+from heliograph.factors.covariance_factors import unit_lower
 from heliograph.live.stored.old_layout import LOWER, VARIANCES, factorise_covariance, split_by_path
 from heliograph.numerics.types import Float, PyTree
 

@@ -13,7 +13,7 @@ from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_
 from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps
 from heliograph.random_affine.hop import known

@@ -16,25 +16,25 @@ from heliograph.model.turn_invariance import check_turns
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.manifold import Manifold
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps, check_forgets, check_maps
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.delay import (
     Delay,
-    Delayed,
+    DelayedLink,
     connect_in_series,
-    place_part,
+    place_channel_of_part,
     signal_size,
 )
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, LawLike
-from heliograph.random_affine.memory import separate_memories
+from heliograph.random_affine.memories_of_channels import separate_memories
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.sum_of_maps import Superposed
 
 Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
@@ -58,7 +58,7 @@ def hop(
     dimension: int = 1,
     *,
     delay: Delay,
-) -> Delayed: ...
+) -> DelayedLink: ...
 @overload
 def hop(
     gain: LawLike,
@@ -80,7 +80,7 @@ def hop(
     dimension: int = 1,
     delay: Delay | None = None,
     known: KnownGain = False,
-) -> GainAndNoise | Delayed | Stack:
+) -> GainAndNoise | DelayedLink | Stack:
     """One radio hop: z = amplification sqrt(power) g y + n, the same gain for all components of y.
 
     `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or one variance common to `dimension`
@@ -159,7 +159,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
     return build_with_told(connect_in_series, separate_memories(check_maps("series", hops)))
 
 
-def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
+def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> DelayedLink:
     """Return a link that receives at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k.
 
     Before the first step zeros were sent.
@@ -173,7 +173,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
-    return build_with_told(lambda links: Delayed(links[0], delay, timestamped), check_maps("delayed link", [link]))
+    return build_with_told(lambda links: DelayedLink(links[0], delay, timestamped), check_maps("delayed link", [link]))
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
@@ -230,7 +230,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
 def _make_as_late(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return links of one signal, each as late as the latest."""
     past = max(c.past for c in links)
-    return [c if c.past == past else place_part(c, signal_size(c), 0, past) for c in links]
+    return [c if c.past == past else place_channel_of_part(c, signal_size(c), 0, past) for c in links]
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -251,7 +251,7 @@ def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAf
     placed = []
     start = 0  # of the link's part in the signal
     for link in links:
-        placed.append(place_part(link, total, start, past))
+        placed.append(place_channel_of_part(link, total, start, past))
         start += signal_size(link)
     return placed
 
@@ -297,7 +297,7 @@ def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
 def _check_added(name: str, link: AbstractRandomAffine) -> None:
     """Raise ValueError where a link delivers what cannot be added up."""
     inside = [link, *all_inner_maps(link)]
-    if any(isinstance(m, ModeOutput) or (isinstance(m, Delayed) and m.timestamped) for m in inside):
+    if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in inside):
         raise fail(name, "one without flags and time stamps, which would be added up", type(link).__name__)
     if link.erases:
         expected = "a loss that the receiver does not see: dropout(link, arrival) inside, erasure(sum, arrival) outside"
@@ -336,7 +336,7 @@ def check_link(
         _ = sensor.noise.covariance
     check_maps("channel", [channel])
     if channel.past and not late:
-        constant = isinstance(channel, Delayed) and channel.constant
+        constant = isinstance(channel, DelayedLink) and channel.constant
         late_filter = ", and hg.filters.late_filter this one for any filter" if constant else ""
         expected = f"one without delays (linear_filter knows them{late_filter})"
         raise fail("channel", expected, f"one that is late by up to {channel.past} steps")

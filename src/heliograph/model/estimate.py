@@ -11,8 +11,8 @@ from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.words.rounded import find_rounded
+from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
@@ -128,7 +128,7 @@ def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
     "upper" where one is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps of
     which its noise is no dither.
     """
-    rounded = find_rounded(*models)
+    rounded = find_rounded_noises(*models)
     if not all(noise.is_exact or noise.is_bounded for noise in rounded):
         return weakest([claim, "nominal"])
     bounded = has_bounded_noise(*models) or any(noise.is_bounded for noise in rounded)

@@ -8,14 +8,13 @@ import numpy as np
 from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar, text
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps
-from heliograph.random_affine.chain import Autoregression, MarkovChain
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.memory import memories, replace_memories
+from heliograph.random_affine.markov_chain_and_autoregression import Autoregression, MarkovChain
+from heliograph.random_affine.memories_of_channels import memories, replace_memories
 from heliograph.random_affine.modes import (
     Faded,
     ModeOutput,
@@ -23,12 +22,13 @@ from heliograph.random_affine.modes import (
     OneStepLate,
     is_memory_irrelevant_for_linear_filter,
     joint_modes,
-    mix_maps,
+    mix_maps_of_modes,
     mode_laws_over_time,
     redraw_modes_each_step,
 )
 from heliograph.random_affine.noise import FiniteSupport, NoiseLike, as_noise, count_components
-from heliograph.random_affine.superposed import split_terms_without_common_memory
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.sum_of_maps import split_terms_without_common_memory
 
 
 def gilbert_elliott(
@@ -202,7 +202,9 @@ def without_memory(channel: Channel) -> Channel:
     if not isinstance(channel, OverTime):
         return redraw_modes_each_step(channel)
     steps = [joint_modes(step, order=2) for step in unstack(channel)]
-    return over_time([mix_maps(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)])
+    return over_time(
+        [mix_maps_of_modes(step, law) for step, law in zip(steps, mode_laws_over_time(steps), strict=True)]
+    )
 
 
 def memory_matters(channel: Channel) -> bool:

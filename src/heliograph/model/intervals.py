@@ -6,7 +6,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, Float
 
 StateLimits = tuple[tuple[str, tuple[float, float]], ...]  # of each limited state its name, lowest and highest value

@@ -17,10 +17,10 @@ from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AbstractSensor
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, are_same
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.memory import AbstractWithMemory, memories, select_alike
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
+from heliograph.random_affine.memories_of_channels import AbstractWithMemory, memories, select_model_of_equal_structure
 from heliograph.random_affine.noise import AbstractNoise, Square, Vector
 
 Transition = MarkovChain | ArrayLike  # a chain, or its probabilities (modes, modes)
@@ -121,7 +121,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         """Return the plant of this mode; for a traced mode, one with its numbers, or a choice among the plants."""
         if isinstance(state, int | np.integer):
             return self.models[state]
-        same_numbers = select_alike(self.models, jnp.asarray(state))
+        same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
         return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
@@ -195,7 +195,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
         """Return the sensor of this mode; for a traced mode, one with its numbers, or a choice among the sensors."""
         if isinstance(state, int | np.integer):
             return self.models[state]
-        same_numbers = select_alike(self.models, jnp.asarray(state))
+        same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
         return _ChosenSensor(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:

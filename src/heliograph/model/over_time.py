@@ -13,7 +13,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import align_memories_over_time
+from heliograph.random_affine.memories_of_channels import align_memories_over_time
 
 T = TypeVar("T")
 

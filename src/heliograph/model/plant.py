@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, covariance, error_text, fail, funct
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import as_real, trace_shape
+from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Names
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -120,8 +120,8 @@ class AbstractPlant(Module):
         Angles are continued from those at `center`; changes of attitudes from `center` become changes from `middle`,
         f(center, u) unless given, added to it.
         """
-        moved: Callable[[jax.Array], jax.Array] = self.manifold.moved(lambda x: self.transition(x, u), center, middle)
-        return moved
+        f: Callable[[jax.Array], jax.Array] = self.manifold.chart_move(lambda x: self.transition(x, u), center, middle)
+        return f
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return f(x, u): shapes (n,), (inputs,) -> (n,)."""

@@ -15,20 +15,20 @@ from heliograph.numerics.check import array, fail, flag, instance, name_list, sc
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float, Names
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.law import AbstractLaw
-from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.reported_law import (
+from heliograph.random_affine.channel_state_information import (
     FreshNumbers,
     FreshReading,
     PilotedHop,
     ToldGainHop,
     ToldMap,
-    told_maps,
+    list_told_maps,
 )
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.law import AbstractLaw
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory
+from heliograph.random_affine.modes import ModeOutput
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.series_and_stack import Stack
 
 M = TypeVar("M", bound=AbstractRandomAffine)
 
@@ -142,13 +142,13 @@ def deliver_told(link: AbstractRandomAffine) -> Stack:
 
 def _list_told_outputs(link: AbstractRandomAffine, sent: int) -> list[ModeOutput]:
     """Return the outputs that tell what each told map of a link tells, beside `sent` numbers."""
-    return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
+    return [ModeOutput(affine.memory, sent) for affine in list_told_maps(link)]
 
 
 class SeparatedTold(NamedTuple):
     """A channel taken apart: the link of the values, and the rows of z in which values and told numbers stand.
 
-    Numbers are in the order of the link's `told_maps`, each once.
+    Numbers are in the order of the link's `list_told_maps`, each once.
     """
 
     link: AbstractRandomAffine
@@ -162,7 +162,7 @@ def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
     A channel that tells nothing is its own link, and all its rows are outputs.
     """
     maps = channel.maps if isinstance(channel, Stack) else (channel,)
-    told_of = {affine.memory.identity for affine in told_maps(channel)}
+    told_of = {affine.memory.identity for affine in list_told_maps(channel)}
     rows, links, at_row = dict[str, tuple[int, ...]](), list[AbstractRandomAffine](), 0
     values: tuple[int, ...] = ()
     for part in maps:
@@ -176,7 +176,7 @@ def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
     if not rows:
         return SeparatedTold(channel, values, ())
     link = links[0] if len(links) == 1 else Stack(links)
-    numbers = [row for affine in told_maps(link) for row in rows[affine.memory.identity]]
+    numbers = [row for affine in list_told_maps(link) for row in rows[affine.memory.identity]]
     return SeparatedTold(link, values, tuple(numbers))
 
 
@@ -222,7 +222,7 @@ def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more:
     link, values, numbers = separate_told(channel)
     count = len(values) + more
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
-    told_names = [name for affine in told_maps(link) for name in affine.names] if numbers else []
+    told_names = [name for affine in list_told_maps(link) for name in affine.names] if numbers else []
     several = {name for name in told_names if told_names.count(name) > 1}
     # From the first row to the last, so that each name is inserted at the place that it has in the end.
     for i, (row, name) in sorted(enumerate(zip(numbers, told_names, strict=True)), key=lambda item: item[1][0]):

@@ -28,11 +28,11 @@ from heliograph.numerics.check import (
 )
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import as_real, trace_shape
+from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
-from heliograph.random_affine.memory import AbstractWithMemory
+from heliograph.random_affine.memories_of_channels import AbstractWithMemory
 from heliograph.random_affine.noise import AbstractNoise, NoiseLike, as_noise, count_components
-from heliograph.random_affine.words.rounded import round_without_dither
+from heliograph.random_affine.words.rounding_noise import round_without_dither
 
 T = TypeVar("T")
 LONG, SHORT = (97, 64), range(1, 13)  # lengths of a state at which a function is tried

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.model.plant import NoiseFunction, check_shape
 from heliograph.numerics.check import array, error_text, fail, name_list, names
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import as_real, trace_shape
+from heliograph.numerics.numpy_or_jax import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Names
 from heliograph.random_affine.noise import as_noise, count_components
 

@@ -20,7 +20,7 @@ from heliograph.numerics.check import (
     show_value,
 )
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
 
 Reference = Literal["sent", "acknowledged", "prediction", "zero"]

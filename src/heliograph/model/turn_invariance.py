@@ -11,7 +11,7 @@ from heliograph.numerics.angle import TURN
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.manifold import Manifold
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.random_affine.noise import Vector
 
 SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.rotation import matrix_of, quaternion_of, rotation_vector_of, turn
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.rotation_vectors import matrix_of, quaternion_of, rotation_vector_of, turn
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 

@@ -13,7 +13,7 @@ from heliograph.model.intervals import StateLimitsLike
 from heliograph.model.plant import TIME_STEP, LinearPlant
 from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.noise import NoiseLike
 

@@ -15,7 +15,7 @@ from heliograph.model.unknown_start import DiffuseStart, UnknownStart
 from heliograph.models.series import Component
 from heliograph.numerics.check import array, fail, instance, items
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, NoiseLike
 

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.model.plant import LinearPlant
 from heliograph.models.continuous_time import continuous_plant
 from heliograph.numerics.check import fail, name_list, scalar
-from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import ArrayLike, Float, Names, rename
 from heliograph.random_affine.noise import NoiseLike
 

@@ -12,7 +12,7 @@ from heliograph.model.plant import Plant, check_shape
 from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, with_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import as_real
+from heliograph.numerics.numpy_or_jax import as_real
 from heliograph.numerics.types import Array, Names
 from heliograph.random_affine.noise import NoiseLike
 

@@ -11,7 +11,7 @@ from heliograph.model.unknown_start import DiffuseStart
 from heliograph.models.motion import WIDE
 from heliograph.numerics.check import array, check_count, fail, instance, items, name_list, scalar, text
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import block_diagonal, is_traced, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
 
 STATIONARY = 1 - 1e-9  # largest modulus of a root that still counts as stationary

@@ -3,7 +3,7 @@
 
 def __getattr__(name: str) -> object:
     """Load a name that other folders take; nothing is imported before, as in `heliograph` itself."""
-    from heliograph.numerics.names import lazy_names
+    from heliograph.numerics.lazy_exports import lazy_names
 
     here = globals()
     here["__getattr__"], here["__dir__"], here["__all__"] = lazy_names(__name__, __file__)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import array, fail, items
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array
 
 TURN = 2 * np.pi

@@ -9,7 +9,7 @@ from weakref import WeakValueDictionary, ref
 import jax
 import numpy as np
 
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 
 S = TypeVar("S")
 P = ParamSpec("P")

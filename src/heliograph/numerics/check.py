@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.traced import is_traced, warn_of_single
+from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.numpy_or_jax import is_traced, warn_of_single
 from heliograph.numerics.types import ArrayLike, Names, NameWithUnit
 
 
@@ -27,33 +27,33 @@ REAL, POSITIVE, PROBABILITY = Domain(), Domain(low=0.0), Domain(low=0.0, high=1.
 SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
 
 
-class MarkedArray(np.ndarray):
+class DomainReportingArray(np.ndarray):
     """Array that reports the domain that a check requires of it; arrays computed from it report nothing."""
 
     report: Callable[[str, Domain], None] | None = None
 
 
-def mark_checked(value: object, report: Callable[[str, Domain], None]) -> MarkedArray:
+def mark_checked(value: object, report: Callable[[str, Domain], None]) -> DomainReportingArray:
     """Return a copy of an array that calls `report(name, domain)` when it is checked."""
-    copy = np.array(value, dtype=np.float64).view(MarkedArray)
+    copy = np.array(value, dtype=np.float64).view(DomainReportingArray)
     copy.report = report
     return copy
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
     """Tell a marked array the domain that is required of it: `whole`, or `entry` of marked entries in a list."""
-    if isinstance(value, MarkedArray):
+    if isinstance(value, DomainReportingArray):
         if value.report is not None:
             value.report(name, whole)
     elif isinstance(value, list | tuple):
         for element in value:
-            if isinstance(element, MarkedArray | list | tuple):
+            if isinstance(element, DomainReportingArray | list | tuple):
                 report_domain(name, element, whole if entry is None else entry, entry)
 
 
 def report_covariance(name: str, value: object) -> None:
     """Tell a marked array that it is a covariance or a variance; in a list of rows, entries on the diagonal."""
-    if isinstance(value, MarkedArray):
+    if isinstance(value, DomainReportingArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
         for i, row in enumerate(value):

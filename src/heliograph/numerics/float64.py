@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.process.garbage_collector import pause_collector
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import PyTree
 
 _first: list[int] = []  # the process in which something was computed first; a fork inherits it
@@ -149,12 +149,12 @@ def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
     for name in names:
         written = vars(kind).get(name)
         if isinstance(written, property) and written.fget is not None:
-            type.__setattr__(kind, name, property(_known_in_float64(written.fget), doc=written.__doc__))
+            type.__setattr__(kind, name, property(_compute_known_in_float64(written.fget), doc=written.__doc__))
         elif callable(written):
-            type.__setattr__(kind, name, _known_in_float64(written))
+            type.__setattr__(kind, name, _compute_known_in_float64(written))
 
 
-def _known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
+def _compute_known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function, computed at once and in float64 where no argument is traced, also inside of a trace."""
 
     @wraps(function)

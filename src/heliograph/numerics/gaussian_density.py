@@ -20,7 +20,7 @@ from heliograph.numerics.types import Bool, Float
 LOG_TURN = float(np.log(2 * np.pi))
 
 
-class _Conditioned(NamedTuple):
+class _ConditionedVector(NamedTuple):
     """What is left of a vector given its first components: its value and covariance, with the log density of these.
 
     `growth`: the largest quotient of a component's variance and what was left of it, by which rounding was amplified.
@@ -60,7 +60,7 @@ def log_density(
     variance = jnp.diagonal(present_covariance)
     agreement = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
-    def condition_on_component(j: Any, state: _Conditioned) -> _Conditioned:
+    def condition_on_component(j: Any, state: _ConditionedVector) -> _ConditionedVector:
         """Add log N of component j given those before it, and condition the components behind it on it."""
         e, left = state.value, state.covariance
         pivot = left[j, j]
@@ -73,7 +73,7 @@ def log_density(
         if_determined = jnp.where(jnp.abs(e[j]) <= agreement[j], 0.0, -jnp.inf)
         # Regression of the other components on component j, which takes from them what it explains.
         column = jnp.where(determined, 0.0, left[:, j] * reciprocal)
-        return _Conditioned(
+        return _ConditionedVector(
             value=e - column * e[j],
             covariance=left - jnp.outer(column, left[j]),
             total=state.total + jnp.where(determined, if_determined, density),
@@ -81,7 +81,7 @@ def log_density(
         )
 
     zero = jnp.zeros((), value.dtype)
-    state = _Conditioned(value=present_value, covariance=present_covariance, total=zero, growth=zero)
+    state = _ConditionedVector(value=present_value, covariance=present_covariance, total=zero, growth=zero)
     if len(value) > WRITTEN:  # a loop, so that the program stays short
         state = jax.lax.fori_loop(0, len(value), condition_on_component, state)
     else:

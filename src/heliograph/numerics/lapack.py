@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import sequential_vmap
 
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Float
 
 A = TypeVar("A", jax.Array, np.ndarray)

@@ -145,7 +145,7 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:
-        """Return X of A X = B."""
+        """Return X of A X = B, A = L L'."""
         # L Y = B, then L' X = Y. L' is upper; with its rows and columns in reverse order it is lower, as Y and X then
         # are upside down.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]

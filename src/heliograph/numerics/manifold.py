@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.angle import Angles, continue_angles, wrap_angles, wrap_near
-from heliograph.numerics.rotation import turn, turn_between
+from heliograph.numerics.rotation_vectors import turn, turn_between
 from heliograph.numerics.types import Array
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -67,7 +67,7 @@ class Manifold(NamedTuple):
             return function
         return lambda x: function(self._replace_rotations(x, turn, center, x - center))
 
-    def moved(
+    def chart_move(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
     ) -> Any:
         """Return the motion of states near `center` as moments are made of it: changes from `middle`, added to it.
@@ -88,7 +88,7 @@ class Manifold(NamedTuple):
         """Return center + (x difference center), (..., n), the inverse of `settle`; angles stay as they are."""
         return self._replace_rotations(x, lambda r, other: other + turn_between(r, other), x, center)
 
-    def reset(self, change: jax.Array) -> jax.Array | None:
+    def reset_jacobian(self, change: jax.Array) -> jax.Array | None:
         """Return d((x + d) difference x')/dd at d = change, x' = x plus change (n, n): the identity but for attitudes.
 
         By it errors about x are errors about x'; the right Jacobian of the rotations. None where all is the identity.

@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.float64 import let_compute_in_float64
-from heliograph.numerics.names import refuse_attribute
+from heliograph.numerics.lazy_exports import refuse_attribute
 
 
 def are_same(x: Any, y: Any) -> bool:
@@ -157,15 +157,15 @@ def format_on_one_line(value: object, depth: int) -> str:
 
     # Containers, item by item.
     if isinstance(value, Mapping) and not _is_ours(value):
-        return _join_some("{", value.items(), len(value), depth, format_pair, "}")
+        return _join_first_items("{", value.items(), len(value), depth, format_pair, "}")
     if isinstance(value, list) and not _is_ours(value):
-        return _join_some("[", value, len(value), depth, format_part, "]")
+        return _join_first_items("[", value, len(value), depth, format_part, "]")
     if isinstance(value, tuple) and not _is_ours(value):
-        return _join_some("(", value, len(value), depth, format_part, ",)" if len(value) == 1 else ")")
+        return _join_first_items("(", value, len(value), depth, format_part, ",)" if len(value) == 1 else ")")
     # Objects with fields.
     if _is_ours(value) or is_dataclass(value):
         parts = list(islice(_list_parts(value), LARGE))
-        return _join_some(f"{type(value).__name__}(", parts, len(parts), depth, format_field, ")")
+        return _join_first_items(f"{type(value).__name__}(", parts, len(parts), depth, format_field, ")")
     if isinstance(value, partial):
         return format_on_one_line(value.func, depth)
     if callable(value):
@@ -204,7 +204,7 @@ def _round_numbers(numbers: object) -> str:
     return f"{numbers:.4g}"
 
 
-def _join_some(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
+def _join_first_items(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
     """Join the first items as text, with the number of those left out; none below the last depth."""
     if count and depth <= 0:
         return f"{start}…{end}"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from heliograph.factors.roots import observe_information, roots_of
+from heliograph.factors.square_root_update import observe_information, roots_of
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
@@ -34,7 +34,7 @@ from heliograph.planning.transmitters import (
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -18,7 +18,7 @@ from heliograph.planning.plant_moments import measured_moment_with_one, steady_m
 from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
-from heliograph.relays.periodic import (
+from heliograph.relays.periodic_steady_state import (
     periodic_behind_relays,
     periodic_given_design,
     periodic_local_error_design,

@@ -13,7 +13,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.lapack import spectral_radius
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 

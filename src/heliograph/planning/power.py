@@ -14,9 +14,9 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
-from heliograph.numerics.keys import seed_key
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.module import Module, readable
+from heliograph.numerics.random_keys import seed_key
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.plant_moments import measured_moment_with_one, moments_with_one_over, steady_moment_with_one
 from heliograph.planning.transmitters import compute_sent_powers, compute_steady_powers

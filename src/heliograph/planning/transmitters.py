@@ -14,11 +14,11 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import fail, items, show_value
-from heliograph.numerics.traced import is_traced, is_zero, library, plain
+from heliograph.numerics.numpy_or_jax import is_traced, is_zero, library, plain
 from heliograph.numerics.types import Array, Bool, Float, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import find_stationary_law
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise
+from heliograph.random_affine.markov_chain_and_autoregression import find_stationary_law
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
 

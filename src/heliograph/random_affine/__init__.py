@@ -2,6 +2,6 @@
 
 Knows nothing of filters or networks. Start with `base`, then `combine`; filters read `second_order`."""
 
-from heliograph.numerics.names import lazy_names
+from heliograph.numerics.lazy_exports import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -4,18 +4,18 @@ from .hop import (
     GainAndNoise as GainAndNoise,
     known as known,
 )
-from .chain import (
+from .markov_chain_and_autoregression import (
     MarkovChain as MarkovChain,
     Autoregression as Autoregression,
 )
 from .mixture import (
     Mixture as Mixture,
 )
-from .combine import (
+from .series_and_stack import (
     Series as Series,
     Stack as Stack,
 )
-from .moments.lift import (
+from .moments.monomial_lift import (
     Lift as Lift,
     square as square,
 )
@@ -38,7 +38,7 @@ from .modes import (
     Modes as Modes,
     joint_modes as joint_modes,
 )
-from .moments.moment_noise import (
+from .moments.noise_from_moments import (
     NoiseMoments as NoiseMoments,
     recorded_noise as recorded_noise,
 )
@@ -54,7 +54,7 @@ from .moments.second_moments import (
 from .phase_rotation import (
     Rotation as Rotation,
 )
-from .superposed import (
+from .sum_of_maps import (
     Superposed as Superposed,
 )
 from .base import (

@@ -10,16 +10,16 @@ from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import fail, items, show_value
 from heliograph.numerics.module import Module, are_same, readable, unwritten
-from heliograph.numerics.traced import is_traced, stack_parts
+from heliograph.numerics.numpy_or_jax import is_traced, stack_parts
 from heliograph.numerics.types import Bool, Float, PyTree
-from heliograph.random_affine.memory import (
+from heliograph.random_affine.memories_of_channels import (
     AbstractWithMemory,
     draw_with_shared_memories,
     init_with_shared_memories,
     memories,
 )
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain
-from heliograph.random_affine.moments.intervals import CORNERS, Interval
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain
+from heliograph.random_affine.moments.interval_products import CORNERS, Interval
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, give_moments
 from heliograph.random_affine.moments.signal_path import (
@@ -316,7 +316,7 @@ class AbstractRandomAffine(Module):
 
 def inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the maps among a map's fields, at any depth of containers and modules, but not those inside other maps."""
-    return [leaf for leaf in _fields(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
+    return [leaf for leaf in _flatten_to_inner_maps(channel)[0] if isinstance(leaf, AbstractRandomAffine)]
 
 
 def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
@@ -326,7 +326,7 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
-    leaves, tree = _fields(channel)
+    leaves, tree = _flatten_to_inner_maps(channel)
     among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
     changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
     same = all(after is before for after, before in zip(changed, leaves, strict=True))
@@ -334,7 +334,7 @@ def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     return rebuilt
 
 
-def _fields(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
+def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
     """Return the leaves of a map, the maps inside it being leaves, and their tree."""
     return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
 

@@ -60,7 +60,7 @@ class AbstractMapWrapper(AbstractComposite):
         return self.parts[0].init(key)
 
 
-class AbstractUniform(AbstractRandomAffine):
+class AbstractOneOfSeveralMaps(AbstractRandomAffine):
     """Random affine map that is at each step one of several maps of one shape."""
 
     maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
@@ -98,12 +98,12 @@ class AbstractUniform(AbstractRandomAffine):
             raise fail(name, "maps of one shape", shapes)
 
 
-def list_in_words(maps: Sequence[AbstractRandomAffine]) -> str:
+def describe_maps_side_by_side(maps: Sequence[AbstractRandomAffine]) -> str:
     """Return maps side by side in words, with bars between them; equal ones by their number."""
     parts = [affine.in_words() or DIRECT for affine in maps]
     return f"{len(parts)} × ({parts[0]})" if len(set(parts)) == 1 else f"({' | '.join(parts)})"
 
 
-def percent_in_words(share: object) -> str:
+def write_percentage(share: object) -> str:
     """Return a share as a percentage of three digits."""
     return f"{100 * float(np.asarray(share)):.3g}%"

@@ -15,15 +15,15 @@ from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_maps, replace_inner_maps
-from heliograph.random_affine.chain import MarkovChain
-from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Discrete
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.series_and_stack import Series, Stack
 
 # Steps; their law at each step; or a chain whose mode is the number of steps.
 Delay = TypeAliasType("Delay", int | Discrete | MarkovChain)
@@ -104,7 +104,7 @@ class DelayLine(AbstractDelayLine):
         return replace_inner_maps(self, [plain]), position
 
 
-class Delayed(AbstractDelayLine):
+class DelayedLink(AbstractDelayLine):
     """Delayed link z_k = G_k y_{k-d} + n_k: at step k arrives what was sent d steps before.
 
     As a map of the line its mean gain is E[G] sum_d p_d S_d, where S_d selects y_{k-d}, and its spread that of the
@@ -128,7 +128,7 @@ class Delayed(AbstractDelayLine):
         self.times = _list_delays(delay)
         self.timestamped = instance("timestamped", timestamped, bool, "True or False")
         # The selection S_d of each possible delay, drawn by its law, by a chain, or certain.
-        selections = [_make_selection(d, self.past, link.inputs, timestamped) for d in self.times]
+        selections = [_make_delay_selection(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
                 self.delay = Mixture(selections, delay.probabilities, delay.radius)
@@ -176,7 +176,7 @@ class Delayed(AbstractDelayLine):
 
     def given(self, d: int) -> AbstractRandomAffine:
         """Return the map of the line for one delay d, without the time stamp."""
-        return Series([_make_selection(d, self.past, self.link.inputs, False), self.link])
+        return Series([_make_delay_selection(d, self.past, self.link.inputs, False), self.link])
 
 
 def _list_delays(delay: Delay) -> tuple[int, ...]:
@@ -193,7 +193,7 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
     return tuple(check_count("delay", d, 0) for d in values)
 
 
-def _make_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
+def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     """Return S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
@@ -217,7 +217,7 @@ def signal_size(channel: AbstractRandomAffine) -> int:
     return channel.inputs // (1 + channel.past)
 
 
-def place_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
+def place_channel_of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
     """Return a channel of y[start:start + size] as one of all of y (total,), and of a line of `past` steps.
 
     The line is at least as long as the channel's own.
@@ -277,7 +277,7 @@ class RelayStorage(AbstractMapWrapper):
         return (inner, receptions[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
-class Relayed(AbstractDelayLine):
+class RelayedLinks(AbstractDelayLine):
     """Links in series, each but the first with a random delay of what the one before delivered."""
 
     stages: tuple[AbstractRandomAffine, ...]
@@ -318,18 +318,18 @@ def connect_in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAf
     # A stage is the first link or one with a random delay, and all links with constant ones that follow it.
     stages: list[list[AbstractRandomAffine]] = [[links[0]]]
     for link in links[1:]:
-        if link.past and not isinstance(link, Delayed):
+        if link.past and not isinstance(link, DelayedLink):
             raise fail("series", "links each delayed by itself", "a combination of delayed links")
-        if isinstance(link, Delayed) and not link.constant:
+        if isinstance(link, DelayedLink) and not link.constant:
             stages.append([link])
         else:
             stages[-1].append(link)
     # Only random delays after the first stage need storage.
     if len(stages) == 1:
         return _join_links_behind_delay(stages[0])
-    if any(isinstance(link, Delayed) and link.timestamped for link in links):
+    if any(isinstance(link, DelayedLink) and link.timestamped for link in links):
         raise fail("time stamps", "those of one link", "those of several in series")
-    return Relayed(tuple(_join_links_behind_delay(stage) for stage in stages))
+    return RelayedLinks(tuple(_join_links_behind_delay(stage) for stage in stages))
 
 
 def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
@@ -338,13 +338,13 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
     A constant delay may be moved to the front past links that forget: their gains and noises are independent over time.
     """
     # Links each late by itself, if at all.
-    delays = [link for link in links if isinstance(link, Delayed)]
+    delays = [link for link in links if isinstance(link, DelayedLink)]
     if not delays:
         return Series(links)
-    if links[0].past and not isinstance(links[0], Delayed):
+    if links[0].past and not isinstance(links[0], DelayedLink):
         raise fail("series", "links each delayed by itself", "a combination of delayed links")
     # The first link's own delay, which may be random (None without one), and the constant ones that are added to it.
-    first, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
+    first, added = (delays[0], delays[1:]) if isinstance(links[0], DelayedLink) else (None, delays)
     # A time stamp has to tell the whole delay. One that is written before a later delay does not; nor does that of a
     # constant delay behind one of the first link's own, which may be random.
     timestamped = [link.timestamped for link in delays]
@@ -353,18 +353,18 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
     if misses_later_delays or misses_first_delay:
         raise fail("time stamps", "those of one link", "those of several in series")
     # All links before the last delay come behind it then, which only those that forget may.
-    last_delay = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
+    last_delay = max(i for i, link in enumerate(links) if isinstance(link, DelayedLink))
     for link in links[:last_delay]:
         if link.remembers:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
     # The links without delays behind one delay: the first link's own, and the constant ones.
-    chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
+    chain = Series([link.link if isinstance(link, DelayedLink) else link for link in links])
     constant_steps = sum(link.times[0] for link in added)
-    delay = constant_steps if first is None else _add_delay(first, constant_steps)
-    return Delayed(chain, delay, timestamped=any(timestamped))
+    delay = constant_steps if first is None else _lengthen_delay(first, constant_steps)
+    return DelayedLink(chain, delay, timestamped=any(timestamped))
 
 
-def _add_delay(link: Delayed, more: int) -> Delay:
+def _lengthen_delay(link: DelayedLink, more: int) -> Delay:
     """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps."""
     match link.delay:
         case Mixture():

@@ -6,10 +6,10 @@ import numpy as np
 
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.traced import plain
+from heliograph.numerics.numpy_or_jax import plain
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome, check_maps
-from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, percent_in_words
+from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, write_percentage
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
@@ -53,7 +53,7 @@ class Erasure(AbstractMapWrapper):
 
     def in_words(self) -> str:
         """Return the map in words, and how much of it is lost."""
-        return f"{self.base.in_words() or DIRECT}, {percent_in_words(1 - self.arrival)} lost"
+        return f"{self.base.in_words() or DIRECT}, {write_percentage(1 - self.arrival)} lost"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of the map, which send whether they are received or not."""

@@ -8,12 +8,12 @@ import numpy as np
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.traced import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, KnownGains, SameNoise
 from heliograph.random_affine.laws.law import AbstractLaw, Constant
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, disturb_hop, noise_gain
-from heliograph.random_affine.moments.intervals import Interval
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, disturb_hop, noise_gain
+from heliograph.random_affine.moments.interval_products import Interval
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import (
     JointMoments,
@@ -24,7 +24,7 @@ from heliograph.random_affine.moments.monomials import (
     symmetric_power,
 )
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_moment_vector
 
 NOTHING_SENT = "nothing sent"  # in words
 ROUNDING = 1e-12  # of a gain of 1 that was computed
@@ -107,7 +107,7 @@ class GainAndNoise(AbstractHop):
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
         """Return sum_k E[g^k] B_k, with B_k the `gain_coefficients`."""
-        gains = gain_moments(self.law, order)
+        gains = tabulate_gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
         return JointMoments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
@@ -118,7 +118,7 @@ class GainAndNoise(AbstractHop):
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         deterministic = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, rest, ways = plan_binomial_sums(self.outputs, order)
-        terms = (ways * noise_vector(self.noise, order)[rest])[:, None] * deterministic[column]
+        terms = (ways * noise_moment_vector(self.noise, order)[rest])[:, None] * deterministic[column]
         return scatter((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
@@ -237,7 +237,7 @@ def affine_matrix(matrix: Matrix) -> Matrix:
     return extended
 
 
-def gain_moments(law: AbstractLaw, order: int) -> Vector:
+def tabulate_gain_moments(law: AbstractLaw, order: int) -> Vector:
     """Return E[g^k] for k = 0, ..., order."""
     moment = law.moment  # of a module, whose methods are slow to look up
     return stack_parts([moment(k) for k in range(order + 1)])

@@ -8,21 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.caching import cache_by_object
-from heliograph.numerics.traced import library, stack_parts
+from heliograph.numerics.numpy_or_jax import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.combine import AbstractCombination, Corners
-from heliograph.random_affine.composite import DIRECT, AbstractUniform, percent_in_words
+from heliograph.random_affine.composite import DIRECT, AbstractOneOfSeveralMaps, write_percentage
 from heliograph.random_affine.hop import NOTHING_SENT, GainAndNoise
 from heliograph.random_affine.laws.law import Constant, Discrete
-from heliograph.random_affine.moments.disturbed_gain import DisturbedGain, mix_gains
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, mix_gains
 from heliograph.random_affine.moments.mixture_components import AffineComponent
 from heliograph.random_affine.moments.monomials import JointMoments, product_table
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noise import Gaussian, Matrix
+from heliograph.random_affine.series_and_stack import AbstractCombination, Corners
 
 
-class Mixture(AbstractUniform, AbstractCombination):
+class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
     """Mixture of maps, one of them drawn at each step; moments are linear in the (possibly uncertain) weights.
 
     Args:
@@ -102,15 +102,15 @@ class Mixture(AbstractUniform, AbstractCombination):
         """Return the maps in words, with their shares; of a map and silence, a loss that nobody notices."""
         parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(parts) == 2 and parts[1] == NOTHING_SENT:
-            return f"{parts[0]}, {percent_in_words(shares[1])} lost unnoticed"
-        choices = (f"{words} ({percent_in_words(p)})" for words, p in zip(parts, shares, strict=True))
+            return f"{parts[0]}, {write_percentage(shares[1])} lost unnoticed"
+        choices = (f"{words} ({write_percentage(p)})" for words, p in zip(parts, shares, strict=True))
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as a choice with transmitters of its own; a hop and its loss are one."""
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)
-        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number(self.maps, "choice")]
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "choice")]
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:

@@ -13,14 +13,21 @@ import numpy as np
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, show_value
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library, stack_parts
+from heliograph.numerics.numpy_or_jax import library, stack_parts
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractModal, AbstractRandomAffine, SameNoise, check_forgets, check_maps
-from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, MemoryStates, Rows
-from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractUniform
+from heliograph.random_affine.composite import DIRECT, AbstractMapWrapper, AbstractOneOfSeveralMaps
 from heliograph.random_affine.hop import AbstractHop, GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.memory import condition_on_states, memories, select_alike
+from heliograph.random_affine.markov_chain_and_autoregression import (
+    AbstractMemory,
+    Autoregression,
+    Law,
+    MarkovChain,
+    MemoryStates,
+    Rows,
+)
+from heliograph.random_affine.memories_of_channels import condition_on_states, memories, select_model_of_equal_structure
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
@@ -29,7 +36,7 @@ from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
 
 
-class Modes(AbstractUniform, AbstractModal):
+class Modes(AbstractOneOfSeveralMaps, AbstractModal):
     """One map for each mode of a chain: at each step it is drawn from the map of the present mode.
 
     Links that name one chain are in one mode at a time; everything else in them is independent. In series, stacked,
@@ -56,8 +63,8 @@ class Modes(AbstractUniform, AbstractModal):
         """Return the map of this mode; for a traced mode, one with its numbers, or a choice among kinds of maps."""
         if isinstance(state, int | np.integer):
             return self.maps[state]
-        present = select_alike(self.maps, jnp.asarray(state))
-        return _ChosenMap(self.maps, jnp.asarray(state)) if present is None else present
+        present = select_model_of_equal_structure(self.maps, jnp.asarray(state))
+        return _MapOfTracedIndex(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return whether `own` is of modes whose chain this one's covers, with maps that are covered one by one."""
@@ -70,7 +77,7 @@ class Modes(AbstractUniform, AbstractModal):
         return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
 
 
-class _ChosenMap(AbstractUniform):
+class _MapOfTracedIndex(AbstractOneOfSeveralMaps):
     """The map of a traced index among several."""
 
     maps: tuple[AbstractRandomAffine, ...]
@@ -243,7 +250,7 @@ def joint_modes(
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     # Each memory as finitely many states.
     held = memories((beside, channel))
-    chains = [_nodes_of_memory(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
+    chains = [_represent_memory_by_nodes(m, order * channel.degree_in(identity), nodes) for identity, m in held.items()]
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -270,7 +277,7 @@ def joint_modes(
     )
 
 
-def _nodes_of_memory(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
+def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
     """Return a memory as finitely many states, as many as its degree in the channel asks for."""
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
@@ -288,10 +295,10 @@ def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffin
     """
     if not channel.remembers:
         return channel
-    return mix_maps(joint_modes(channel, order=2))
+    return mix_maps_of_modes(joint_modes(channel, order=2))
 
 
-def mix_maps(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
+def mix_maps_of_modes(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
     """Return one of the modes' maps, by a law (that of the long run unless given)."""
     in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
     return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.columns import WeightedColumns, columns_of, eliminate, square_root
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, eliminate, square_root
 from heliograph.numerics import check
 from heliograph.numerics.check import array, fail, instance, items, show_value
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, plain, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, plain, stack_parts
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import draw_index
 from heliograph.random_affine.moments.mixture_components import (
@@ -394,7 +394,7 @@ def count_components(value: NoiseLike) -> int | None:
 
 
 @singledispatch
-def noise_vector(noise: AbstractNoise, order: int) -> Vector:
+def noise_moment_vector(noise: AbstractNoise, order: int) -> Vector:
     """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
     moment = noise.moment  # of a module, whose methods are slow to look up
     return stack_parts([moment(powers[:-1]) for powers in list_exponents(noise.dimension + 1, order)])

@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import scalar
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import known

@@ -6,12 +6,12 @@ from .design import (
     relay_schedules as relay_schedules,
     local_error_design as local_error_design,
 )
-from .periodic import (
+from .periodic_steady_state import (
     periodic_behind_relays as periodic_behind_relays,
     periodic_given_design as periodic_given_design,
     periodic_local_error_design as periodic_local_error_design,
 )
-from .periodic import (
+from .periodic_steady_state import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
 )
@@ -19,6 +19,6 @@ from .design import (
     receiver_behind_relays as receiver_behind_relays,
     receiver_system as receiver_system,
 )
-from .receiver_error import (
+from .design_for_receiver_error import (
     receiver_error_design as receiver_error_design,
 )

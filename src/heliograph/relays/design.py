@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.linear.jump_system import propagate_by_mode
-from heliograph.linear.recursion import lmmse
+from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.estimate import lower_by_noise
@@ -20,11 +20,11 @@ from heliograph.numerics.linalg import contract
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.error_moments import (
-    Propagated,
+    PropagatedMoments,
     correct_moments,
     initial_error_moments,
-    linear_maps,
-    propagate_slots,
+    make_error_step_maps,
+    propagate_error_moments,
     step_moments,
 )
 
@@ -72,13 +72,13 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = join_gains(network, gains)
     steps = network.steps(len(joined))
-    return make_design(network, _propagate(steps, start_moments(network), joined))
+    return make_design(network, _propagate(steps, initial_error_covariance(network), joined))
 
 
-_propagate = compile_in_float64(propagate_slots)
+_propagate = compile_in_float64(propagate_error_moments)
 
 
-def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
+def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
     """Return the covariance of (x_0, e_1 .. e_F)."""
     return initial_error_moments(network.initial()[1], len(network.filters))
 
@@ -108,7 +108,7 @@ def split_gains(
     }
 
 
-def make_design(network: RelayNetwork, propagated: Propagated) -> RelayDesign:
+def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
     """Return a design of gains and moments as propagated; ValueError unless all moments are finite."""
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
@@ -205,7 +205,7 @@ def _make_gains(
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     """Raise ValueError for a design with other moments at k = 0 than the network's, as a periodic one has."""
     # Equal to the rounding of both; of a periodic design first and last to what its iteration ends at.
-    expected, start = start_moments(network), design.moments[0]
+    expected, start = initial_error_covariance(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
         got = "a periodic one (use given_design with its gains repeated)" if periodic else "one from another start"
@@ -241,7 +241,7 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    return make_design(network, _propagate(network.steps(horizon), start_moments(network)))
+    return make_design(network, _propagate(network.steps(horizon), initial_error_covariance(network)))
 
 
 def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Schedule:
@@ -280,7 +280,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    side = _list_relay_sides(steps, start_moments(network), joined)
+    side = _list_receiver_views(steps, initial_error_covariance(network), joined)
     count, r, d = side.output.shape
     # Means: x+ has drift a, z the constant b, the last r of what is received in the network.
     _rows, constants = steps.predict_maps()
@@ -298,7 +298,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     )
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     start_mean, _start_covariance = network.initial()
-    mean[:n], covariance[:d, :d] = start_mean, start_moments(network)[:d, :d]
+    mean[:n], covariance[:d, :d] = start_mean, initial_error_covariance(network)[:d, :d]
     # Gains on what nobody transmits are not used. The receiver comes last, behind all relays.
     ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
     relayed = {
@@ -324,7 +324,7 @@ def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray
     return join_gains(network, relays | {RECEIVER: np.zeros((length, n, network.received[-1]))})
 
 
-class RelaySide(NamedTuple):
+class ReceiverViewOfRelays(NamedTuple):
     """Relays closed with their gains, seen from the receiver: zeta+ = A zeta + a, z = C zeta + c, zeta = (x, e_relays).
 
     transition A, output C, and the joint covariance of (a, c): white, and uncorrelated with zeta, since what a random
@@ -336,7 +336,9 @@ class RelaySide(NamedTuple):
     noise: Float[jax.Array, "*time d+r d+r"]
 
 
-def make_relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
+def make_receiver_view(
+    step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]
+) -> ReceiverViewOfRelays:
     """Return the linear system of zeta = (x, e_1 ... e_relays) that the receiver estimates, in one step.
 
     Args:
@@ -346,7 +348,7 @@ def make_relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[
         gain: K of all filters as one block matrix, over what all of them receive.
     """
     n, r = step.transition.shape[-1], step.received[-1]
-    maps, d = linear_maps(step), moments.shape[0]
+    maps, d = make_error_step_maps(step), moments.shape[0]
     # Sizes of zeta, and of what all relays receive: without the receiver's error and what it receives.
     zeta, relay_rows = d - n, step.gain.shape[0] - r
     # (zeta+ before corrections, the relays' innovations, z), as rows over (x, e_1 ... e_F, w, v).
@@ -363,17 +365,19 @@ def make_relay_side(step: RelaySteps, moments: Float[Array, "d d"], gain: Float[
     _, sent = step_moments(step, moments)
     of_random_gains = propagate_by_mode(correct[:, zeta:], contract(step.spread, sent.second), 0.0)
     white = propagate_by_mode(corrected[:, d:], noise, of_random_gains)
-    return RelaySide(transition=corrected[:zeta, :zeta], output=corrected[zeta:, :zeta], noise=white)
+    return ReceiverViewOfRelays(transition=corrected[:zeta, :zeta], output=corrected[zeta:, :zeta], noise=white)
 
 
 @compile_in_float64
-def _list_relay_sides(steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
-    """Return the system of (x, e_relays) that `make_relay_side` describes, at each step."""
+def _list_receiver_views(
+    steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]
+) -> ReceiverViewOfRelays:
+    """Return the system of (x, e_relays) that `make_receiver_view` describes, at each step."""
 
-    def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, RelaySide]:
+    def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
         """Return the moments after a step, and the system at it."""
         step, gain = row
         after = correct_moments(step_moments(step, moments)[0], gain * step.receives_in_slot)
-        return after, make_relay_side(step, moments, gain)
+        return after, make_receiver_view(step, moments, gain)
 
     return jax.lax.scan(move, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

@@ -25,8 +25,11 @@ class SentMoments(NamedTuple):
     power: Float[jax.Array, "senders"]
 
 
-class LinearMaps(NamedTuple):
-    """Rows over (x, e_1 .. e_F, w, v): eta+ before corrections, innovations, sent signals."""
+class ErrorStepMaps(NamedTuple):
+    """Matrices that give, from (x, e_1 .. e_F, w, v), what one step makes of the state and the F filters' errors.
+
+    moved: eta+ = (x+, e_1+ .. e_F+) before corrections; innovation: the filters' innovations; sent: the signals sent.
+    """
 
     moved: Float[jax.Array, "d sources"]
     innovation: Float[jax.Array, "R sources"]
@@ -38,8 +41,8 @@ def initial_error_moments(covariance: Float[np.ndarray, "n n"], filters: int) ->
     return np.asarray(np.kron(np.ones((1 + filters, 1 + filters)), covariance))
 
 
-def linear_maps(step: RelaySteps) -> LinearMaps:
-    """Return the deterministic part of one step, with E G in place of random gains."""
+def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
+    """Return the matrices of one step, with the means E G in place of random gains."""
     (m, n), filters = step.sensing.shape, len(step.received)
     d = (1 + filters) * n
     # Rows that select x, e_1 .. e_F, and the noises w and v.
@@ -56,7 +59,7 @@ def linear_maps(step: RelaySteps) -> LinearMaps:
     sent_of_estimate = jnp.stack([jnp.asarray(c) for c in senders]).reshape(-1, n)
     prediction = jnp.asarray(step.gain) @ sent_of_estimate
     predicted = jnp.einsum("rn,rnc->rc", prediction, estimates[step.owner])
-    return LinearMaps(moved=moved.reshape(d, -1), innovation=jnp.asarray(step.gain) @ sent - predicted, sent=sent)
+    return ErrorStepMaps(moved=moved.reshape(d, -1), innovation=jnp.asarray(step.gain) @ sent - predicted, sent=sent)
 
 
 def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
@@ -71,7 +74,7 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
 
     d = (1 + F) n, z = d + R.
     """
-    maps, mean = linear_maps(step), sent_mean(step)
+    maps, mean = make_error_step_maps(step), sent_mean(step)
     # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
     sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
     second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
@@ -143,7 +146,7 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
     return gain
 
 
-class Propagated(NamedTuple):
+class PropagatedMoments(NamedTuple):
     """Gains, the covariance of eta before and after each step, and the power of each sender."""
 
     gains: Float[Array, "time Fn R"]
@@ -151,9 +154,9 @@ class Propagated(NamedTuple):
     power: Float[Array, "time senders"]
 
 
-def propagate_slots(
+def propagate_error_moments(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"] | None = None
-) -> Propagated:
+) -> PropagatedMoments:
     """Propagate the covariance of eta = (x, e_1 ... e_F) over the steps; return it with gains and powers over time.
 
     Args:
@@ -174,7 +177,7 @@ def propagate_slots(
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))
     _, (gains, moments, power) = jax.lax.scan(move, start, items)
-    return Propagated(gains, jnp.concatenate([start[None], moments]), power)
+    return PropagatedMoments(gains, jnp.concatenate([start[None], moments]), power)
 
 
 DAMPING = 1e-9  # relative, on the change of a gain: decides only what the receiver's error does not

@@ -1,5 +1,5 @@
 """Figures and self-contained HTML pages; the only place that imports a plotting library (the extra `report`)."""
 
-from heliograph.numerics.names import lazy_names
+from heliograph.numerics.lazy_exports import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
-from heliograph.numerics.counted_shares import count_independent
+from heliograph.numerics.confidence_intervals import count_independent
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.report.sending_pattern import Pattern, find_pattern
 from heliograph.report.sending_rate import Rate, find_rate

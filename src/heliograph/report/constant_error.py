@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.numerics.counted_shares import average_correlated
+from heliograph.numerics.confidence_intervals import average_correlated
 from heliograph.numerics.types import Bool, Float
 from heliograph.report.outputs import round_to
 

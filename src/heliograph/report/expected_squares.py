@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.numerics.counted_shares import average_correlated
+from heliograph.numerics.confidence_intervals import average_correlated
 from heliograph.numerics.types import Float
 
 

@@ -15,7 +15,7 @@ from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
-from heliograph.numerics.counted_shares import average_correlated
+from heliograph.numerics.confidence_intervals import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.compared_nodes import compare_nodes

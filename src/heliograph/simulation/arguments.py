@@ -9,7 +9,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.numerics.check import array, check_columns, check_seed, fail, rank, show_value
-from heliograph.numerics.keys import seed_key
+from heliograph.numerics.random_keys import seed_key
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import scipy
 
-from heliograph.linear.known_losses import (
+from heliograph.linear.known_loss_stability import (
     BELOW_ONE,
     KindGains,
     KnownLossSystem,
@@ -30,7 +30,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes, long_run_law
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -113,7 +113,7 @@ def certify_boundedness(network: Network) -> Boundedness:
         gains = find_gains(known.system)
         radius = certify_radius(known.system, gains)
         if radius < BELOW_ONE:
-            bound = known.system.bound(gains).sum(axis=0) if known.exact else None
+            bound = known.system.solve_steady_covariances(gains).sum(axis=0) if known.exact else None
             return Boundedness(
                 verdict="certified",
                 reason=_describe_certificate(a, radius),

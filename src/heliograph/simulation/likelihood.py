@@ -12,7 +12,7 @@ from heliograph.filters.filter_data import check_data
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
 
 

@@ -23,7 +23,7 @@ from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.simulation.centres.mesh_check import check_mesh
 from heliograph.simulation.channel_flags import check_flags
 from heliograph.simulation.claims import (

@@ -13,7 +13,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.runs.side_by_side import StackedFilters, map_all
 from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.backward_pass import plan_with_past
+from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_steps
 
 
 def plan_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
@@ -41,7 +41,7 @@ def _plan_stack(alike: StackedFilters, u: Array) -> StackedFilters:
 
 def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
     """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
-    return plan_with_past(filter, u) if smooths else filter.planned(u)
+    return plan_with_smoother_steps(filter, u) if smooths else filter.planned(u)
 
 
 _planned_by_xla = quickly_compiled(_plan_filter)

@@ -14,7 +14,7 @@ from heliograph.model.words.encoder import Words
 from heliograph.model.words.word_channel import FLAG, find_places
 from heliograph.numerics.check import fail, show_value
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
-from heliograph.random_affine.words.flips import Flips
+from heliograph.random_affine.words.bit_flips import Flips
 
 
 def compares_with_prediction(filter: AbstractFilter, trigger: AbstractTrigger) -> bool:

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, check_progress, fail, instance
 from heliograph.numerics.float64 import quickly_compiled, refuse_forked_process
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.random_affine.memory import drop_identities
+from heliograph.random_affine.memories_of_channels import number_unnamed_memories
 from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
@@ -121,7 +121,7 @@ def monte_carlo(
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
     planned = plan_filters(filters, u) if has_plan(filters) else filters
     job = _SimulationJob(
-        world=World(drop_identities(network.plant), make_reception(network), planned),
+        world=World(number_unnamed_memories(network.plant), make_reception(network), planned),
         later=None if smoothing is None else smoothing.smoother(filters),
         inputs=u,
         key=base,

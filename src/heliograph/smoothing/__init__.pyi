@@ -10,7 +10,7 @@ from .rts import (
     PlannedSmoother as PlannedSmoother,
     planned_smoother as planned_smoother,
 )
-from .backward_pass import (
+from .forward_and_backward_pass import (
     smoother_steps as smoother_steps,
 )
 from .simulation_smoother import (

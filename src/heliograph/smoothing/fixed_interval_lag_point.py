@@ -14,9 +14,9 @@ from heliograph.filters.smoother_step import SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float
-from heliograph.smoothing.backward_pass import (
+from heliograph.smoothing.forward_and_backward_pass import (
     smooth_fixed_interval,
     smooth_fixed_interval_means,
     smooth_fixed_lag,

@@ -13,9 +13,13 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import data_free_smoother_steps, plan_with_past, step_rows
-from heliograph.smoothing.chunks import smooth_in_chunks
+from heliograph.smoothing.chunked_smoother import smooth_in_chunks
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, FixedInterval, warn_if_inconsistent
+from heliograph.smoothing.forward_and_backward_pass import (
+    data_free_smoother_steps,
+    filter_rows_with_smoother_steps,
+    plan_with_smoother_steps,
+)
 
 
 @readable
@@ -66,7 +70,7 @@ def rts_smoother(
         warn_if_inconsistent("smoothing", in_chunks.sums)
         estimate = in_chunks.estimate
     else:
-        _, steps = step_rows(filter, rows, inputs, filter.init(), np.asarray(0))
+        _, steps = filter_rows_with_smoother_steps(filter, rows, inputs, filter.init(), np.asarray(0))
         estimate = FixedInterval().estimates(steps)
     modes = None if estimate.modes is None else np.asarray(estimate.modes)
     return Smoothed(np.asarray(estimate.mean), np.asarray(estimate.covariance), estimate.claim, modes)
@@ -125,14 +129,14 @@ def planned_smoother(
 @compile_on_call
 def _smoothed_means(planned: PlannedSmoother, z: Array) -> jax.Array:
     """Return the smoothed means of one run's measurements (horizon, received)."""
-    _, steps = step_rows(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
+    _, steps = filter_rows_with_smoother_steps(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
     return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
 @compile_on_call
 def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
     """Return the planned filter with its smoother steps; None where gains depend on data."""
-    planned = plan_with_past(filter, u)
+    planned = plan_with_smoother_steps(filter, u)
     return None if planned is filter else planned
 
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import square_root
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.covariance_factors import square_root
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
@@ -13,7 +13,7 @@ from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.smoothing.backward_pass import step_rows, take_step, take_steps
+from heliograph.smoothing.forward_and_backward_pass import filter_rows_with_smoother_steps, take_step, take_steps
 
 
 def simulation_smoother(
@@ -55,7 +55,7 @@ def simulation_smoother(
 @compile_in_float64
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
     """Draw one path for each key (draws, steps, n), by one filter pass."""
-    _, steps = step_rows(filter, z, u, filter.init(), np.asarray(0))
+    _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), np.asarray(0))
     if steps.before is None:
         raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
     drawn: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
@@ -68,6 +68,7 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Draw the filter's state between two steps, given the one drawn after both; keep the plant's."""
         previous, step, key = pair
+        # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
         left, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
         x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))

@@ -1,5 +1,5 @@
 """Contract tests for your own channels, filters, quantizers and fusion rules; they raise AssertionError."""
 
-from heliograph.numerics.names import lazy_names
+from heliograph.numerics.lazy_exports import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -8,7 +8,7 @@ import scipy
 
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import evaluate_monomials, list_exponents
 from heliograph.simulation.runs.over_runs import over_runs

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
@@ -33,7 +33,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.monomials import list_exponents
-from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 

@@ -15,9 +15,9 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.series_and_stack import Series
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable
 
 from straightline.nodes import REAL, Node, Type, Unsupported
-from straightline.vectors.elementary import FUNCTIONS, SCALAR
+from straightline.vectors.elementary_functions import FUNCTIONS, SCALAR
 
 LLVM = {"f64": "double", "f32": "float", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
 BITS = {"f64": 64, "f32": 32, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory
@@ -184,8 +184,8 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
     if by.op == "constant" and 0 <= by.value < BITS[type]:
         return emit(f"{instruction} {text} {a}, {b}")
     # By at most all bits but one, which leaves the sign; other shifts by more are zero.
-    at_most = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
-    shifted = emit(f"{instruction} {text} {a}, {at_most}")
+    limit_new_nodes = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
+    shifted = emit(f"{instruction} {text} {a}, {limit_new_nodes}")
     if instruction == "ashr":
         return shifted
     in_range = emit(f"icmp ult {text} {b}, {write_splat(BITS[type], type)}")

@@ -33,7 +33,7 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
     return max(loops, key=lambda loop: loop.length or 0) if loops else None
 
 
-def count_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
+def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
     """Return how many cache lines a loop asks for in each of its turns, so that it asks for all rows of W runs.
 
     0 where these take longer than its operations: a loop that does little but move numbers hides nothing beside them.
@@ -44,7 +44,9 @@ def count_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
     return lines if lines * PATIENCE <= operations else 0
 
 
-def write_requests(rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]) -> list[str]:
+def write_prefetch_requests(
+    rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]
+) -> list[str]:
     """Return the lines of LLVM IR by which one turn of a loop asks for its share of the memory of some rows.
 
     Args:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from straightline.limits import FEW
 from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, make_placeholder, result_shape
 from straightline.nodes import Unsupported
+from straightline.size_limits import FEW
 
 SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
 Numbers = dict[tuple[int, int], jax.Array]  # entries by row and column
@@ -33,7 +33,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     finite = jnp.all(jnp.isfinite(a))
     # The upper triangle of (A + A') / 2, in a unit in which squares of entries neither overflow nor vanish. Before the
     # first rotation the eigenvectors are the identity matrix.
-    unit = _choose_unit(a)
+    unit = _choose_power_of_two_unit(a)
     entries = {(i, j): (a[i, j] / unit + a[j, i] / unit) / 2 for i in range(n) for j in range(i, n)}
     vectors = {(i, j): jnp.asarray(float(i == j), a.dtype) for i in range(n) for j in range(n)}
     # Off-diagonal entries below eps ||A||_F / n are rounding; in the norm those above the diagonal count twice.
@@ -62,7 +62,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(finite, eigenvectors, jnp.nan), jnp.where(finite, jnp.stack(values) * unit, jnp.nan)
 
 
-def _choose_unit(a: jax.Array) -> jax.Array:
+def _choose_power_of_two_unit(a: jax.Array) -> jax.Array:
     """Return a power of two in whose units squares of the matrix's entries neither overflow nor vanish, mostly 1."""
     largest, power = jnp.max(jnp.abs(a)), 300 if a.dtype == np.float64 else 50
     return jnp.where(largest > 2.0**power, 4.0**power, jnp.where(largest < 2.0**-power, 4.0**-power, 1.0))
@@ -141,7 +141,7 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    return _decompose_each(lowering, _eigh_program(shape[-1], avals[0].dtype), equation, inputs[0])
+    return _decompose_each(lowering, _trace_eigh(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
@@ -155,7 +155,7 @@ def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn
 
 
 @cache
-def _eigh_program(n: int, dtype: Any) -> ClosedJaxpr:
+def _trace_eigh(n: int, dtype: Any) -> ClosedJaxpr:
     """Return `eigh` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(eigh)(make_placeholder((n, n), dtype))
@@ -211,11 +211,11 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:
         raise Unsupported(f"factors of a matrix of shape {shape[-2:]}")
-    return _decompose_each(lowering, _lu_program(shape[-1], avals[0].dtype), equation, inputs[0])
+    return _decompose_each(lowering, _trace_lu(shape[-1], avals[0].dtype), equation, inputs[0])
 
 
 @cache
-def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
+def _trace_lu(n: int, dtype: Any) -> ClosedJaxpr:
     """Return `lu` of a matrix (n, n), traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(lu)(make_placeholder((n, n), dtype))
@@ -223,12 +223,12 @@ def _lu_program(n: int, dtype: Any) -> ClosedJaxpr:
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Return the order of rows after the exchanges of each vector of pivots."""
-    program = _permutation_program(inputs[0].shape[-1], equation.params["permutation_size"])
+    program = _trace_permutation(inputs[0].shape[-1], equation.params["permutation_size"])
     return _decompose_each(lowering, program, equation, inputs[0])
 
 
 @cache
-def _permutation_program(count: int, size: int) -> ClosedJaxpr:
+def _trace_permutation(count: int, size: int) -> ClosedJaxpr:
     """Return `permutation` of so many pivots, traced."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(make_placeholder((count,), np.int32))

@@ -9,27 +9,27 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import WRITTEN_OUT
 from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, list_nodes
-from straightline.memory import InMemory
 from straightline.nodes import Block, Buffer, Loop, LoopExit, Node, RandomKey, Type, Unsupported
 from straightline.rules.elementwise import select
+from straightline.size_limits import WRITTEN_OUT
+from straightline.strided_arrays import StridedArray
 
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
 def repeat_turns(
     lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
-) -> tuple[list[np.ndarray], list[InMemory]]:
+) -> tuple[list[np.ndarray], list[StridedArray]]:
     """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
 
     turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or down to 0.
     """
     graph, outer = lowering.graph, lowering.graph.current
 
-    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[InMemory]]:
+    def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
         """Return the next carry, and the memory in which each turn stores a row."""
-        loop.counter = counter = graph.fresh("counter", "i64", (), loop.body, loop)
+        loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
         following, stacked = turn(row, carry)
         return following, [_store_row(lowering, length, x, counter, backwards, outer) for x in stacked]
@@ -58,7 +58,7 @@ def _lower_loop(
         nodes_before = graph.serial
         loop = Loop(Block(outer), length, _flatten_carry(carry, by_triangle))
         # In the body the carry is a parameter; the turn is traced once.
-        loop.parameters = _make_stand_ins(graph, "parameter", loop, loop.body)
+        loop.parameters = _make_carried_nodes(graph, "parameter", loop, loop.body)
         graph.current = loop.body
         following, beside = body(loop, _restore_arrays(carry, loop.parameters, by_triangle))
         graph.current = outer
@@ -71,13 +71,13 @@ def _lower_loop(
     loop.following = _flatten_carry(following, by_triangle)
     outer.items.append(loop)
     # After the loop the carry is a result.
-    loop.results = _make_stand_ins(graph, "result", loop, outer)
+    loop.results = _make_carried_nodes(graph, "result", loop, outer)
     return _restore_arrays(carry, loop.results, by_triangle), beside
 
 
-def _make_stand_ins(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
+def _make_carried_nodes(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
     """Make a node for each carried number, which stands for it in the body ("parameter") or after it ("result")."""
-    return [graph.fresh(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
+    return [graph.make_fresh_node(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
 
 
 def is_symmetric(x: np.ndarray) -> bool:
@@ -95,12 +95,12 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
-) -> InMemory:
+) -> StridedArray:
     """Store one turn's array as one row of memory; return the array (length, ...) of all turns.
 
     The row's number is that of the turn, `counter`, or counted from the last row back.
     """
-    flat = _list_numbers(value)
+    flat = _list_nodes_of_numbers(value)
     type: Type = flat[0].type if flat else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
     # The first place of each node in a row, if some nodes have several: noted from the end on, so that the first stays.
@@ -109,10 +109,10 @@ def _store_row(
     start, stride = ((length - 1) * size, -size) if backwards else (0, size)
     for entry, node in enumerate(flat):
         lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
-    return InMemory.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
-def _list_numbers(value: np.ndarray) -> list[Node]:
+def _list_nodes_of_numbers(value: np.ndarray) -> list[Node]:
     """Return the nodes of an array in order; raise if they are keys of random numbers."""
     flat: list[Node] = value.ravel().tolist()
     if any(isinstance(x, RandomKey) for x in flat):
@@ -138,11 +138,11 @@ def _restore_arrays(
             for x in old_entries.ravel().tolist()
         ]
         restored = arrange_nodes(new_entries, old_entries.shape)
-        results.append(_mirror(restored, n) if has_triangle else restored)
+        results.append(_mirror_triangles(restored, n) if has_triangle else restored)
     return results
 
 
-def _mirror(upper: np.ndarray, n: int) -> np.ndarray:
+def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices (..., n, n) from their upper triangles, row by row (..., n (n + 1) / 2)."""
     # The place of each entry in its row: those below the diagonal, 0 here, have the place of the entry across it.
     places = np.zeros((n, n), dtype=int)
@@ -156,7 +156,7 @@ def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
     The arguments of a scan are constants, the carry, and arrays of which each turn gets a row.
     """
     params = equation.params
-    (consts, carried), length = _count_arguments(params), params["length"]
+    (consts, carried), length = _count_scan_arguments(params), params["length"]
     fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
     size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
     if size <= lowering.written_out or length <= 1:  # a loop of one turn would be no shorter
@@ -208,23 +208,23 @@ class CarriedMemory:
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
 
-    def view_in_turn(self) -> InMemory:
+    def view_in_turn(self) -> StridedArray:
         """Return the array in the turn whose body is open."""
         self.memory.parts = []  # a body that is lowered once more fills it alone
         return self.view_from_here()
 
-    def view_from_here(self) -> InMemory:
+    def view_from_here(self) -> StridedArray:
         """Return the array as the block that is open reads it from here on."""
         return self._view_part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
 
-    def fill(self, lowering: Lowering, x: InMemory) -> None:
+    def fill(self, lowering: Lowering, x: StridedArray) -> None:
         """Fill the memory with an array that is elsewhere."""
         self._view_part(copy_in_memory(lowering, x).buffer)
 
-    def _view_part(self, buffer: Buffer) -> InMemory:
+    def _view_part(self, buffer: Buffer) -> StridedArray:
         """Place a buffer in this memory; return the view of it."""
-        self.memory.take_in(buffer, 0)
-        return InMemory.whole(buffer)
+        self.memory.place_buffer_inside(buffer, 0)
+        return StridedArray.of_whole_buffer(buffer)
 
 
 def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory, Value]]) -> None:
@@ -239,7 +239,7 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
         carried.fill(lowering, x)
 
 
-def _count_arguments(params: dict[str, Any]) -> tuple[int, int]:
+def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
     """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
@@ -255,7 +255,7 @@ def _write_out_scan(
     stacked: list[list[Value]] = []
     turns = range(params["length"])
     for turn in reversed(turns) if params["reverse"] else turns:
-        items = [x.row(turn) if isinstance(x, InMemory) else _take_row(x, turn) for x in rows]
+        items = [x.row(turn) if isinstance(x, StridedArray) else _take_row(x, turn) for x in rows]
         results = lowering.inline_program(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
@@ -272,23 +272,23 @@ def _take_row(x: np.ndarray, turn: int) -> np.ndarray:
     return x[turn : turn + 1].reshape(x.shape[1:])
 
 
-def put_in_memory(lowering: Lowering, value: Value) -> InMemory:
+def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
     """Return an array in memory: as it is if it is there, a table of constants, else stored entry by entry."""
-    if isinstance(value, InMemory):
+    if isinstance(value, StridedArray):
         return value
-    flat = _list_numbers(value)
+    flat = _list_nodes_of_numbers(value)
     graph = lowering.graph
     type: Type = flat[0].type if flat else "f64"
     if all(n.op == "constant" for n in flat):
         table = np.array([n.value for n in flat]).reshape(value.shape)
-        return InMemory.whole(Buffer("table", type, value.shape, graph.top, table))
+        return StridedArray.of_whole_buffer(Buffer("table", type, value.shape, graph.top, table))
     buffer = Buffer("scratch", type, value.shape, graph.current)
     for index, node in enumerate(flat):
         graph.store(buffer, node, index, (), ())
-    return InMemory.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
-def copy_in_memory(lowering: Lowering, x: InMemory) -> InMemory:
+def copy_in_memory(lowering: Lowering, x: StridedArray) -> StridedArray:
     """Copy a long array to new memory, row by row in a loop; return the copy."""
     return repeat_turns(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
 
@@ -308,12 +308,12 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))
         loop.body.items.append(LoopExit(loop))
         moved = [lowering.nodes(x) for x in lowering.inline_program(params["body_jaxpr"], [*of_body, *carry])]
-        return [_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
+        return [_select_where_active(graph, active, new, old) for new, old in zip(moved, carry, strict=True)], None
 
     return _lower_loop(lowering, None, [lowering.nodes(x) for x in inputs[conditional + fixed :]], body)[0]
 
 
-def _where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     """Return new entries where a loop goes on, and the old ones elsewhere."""
     conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
     entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.folding import DTYPES
+from straightline.constant_folding import DTYPES
 from straightline.graph import Graph
 from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape, result_type
 from straightline.nodes import REAL, Node, Type, Unsupported

@@ -16,10 +16,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import LOADED
 from straightline.lowering import RULES, Lowering, arrange_nodes, make_keys, result_shape
 from straightline.nodes import Node, RandomKey, Unsupported
 from straightline.rules.elementwise import broadcast_entries
+from straightline.size_limits import LOADED
 
 Word = Any  # of 32 bits, in an integer or an array of wider ones
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)

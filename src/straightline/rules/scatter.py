@@ -10,11 +10,11 @@ from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
 from straightline.graph import Graph
-from straightline.limits import WRITTEN_OUT
 from straightline.lowering import RULES, Lowering, Rule, known_integers
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
-from straightline.rules.places import convert_to_32_bits, fills_outside, find_window_places
+from straightline.rules.index_bounds import convert_to_32_bits, fills_outside, find_window_places
+from straightline.size_limits import WRITTEN_OUT
 
 
 def _make_scatter_rule(op: str | None) -> Rule:
@@ -44,7 +44,7 @@ def _make_scatter_rule(op: str | None) -> Rule:
         updated = x.ravel().copy()
         for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
             if place >= 0:
-                updated[place] = _combine(lowering.graph, op, updated[place], new)
+                updated[place] = _combine_entry(lowering.graph, op, updated[place], new)
         return [updated.reshape(x.shape)]
 
     return scatter_updates
@@ -55,7 +55,7 @@ def _clips_indices(equation: JaxprEqn) -> bool:
     return bool(equation.params["mode"] == GatherScatterMode.CLIP)
 
 
-def _combine(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
+def _combine_entry(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
     """Return `old op new`, or `new` in place of the old number where there is no operation."""
     return new if op is None else graph.node(op, new.type, old, new)
 
@@ -100,7 +100,7 @@ def _scatter_by_cases(
                 for axis, offset in zip(window_axes, entry, strict=True):
                     place[axis] += offset
                 old = updated[tuple(place)]
-                new = _combine(graph, op, old, windows[row + entry])
+                new = _combine_entry(graph, op, old, windows[row + entry])
                 updated[tuple(place)] = select(graph, is_here, new, old)
     return updated
 

@@ -7,10 +7,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, Rule, arrange_nodes, result_shape
 from straightline.nodes import Node, Unsupported
 from straightline.rules.elementwise import select
+from straightline.size_limits import FEW
 
 
 def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:

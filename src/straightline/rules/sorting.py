@@ -4,10 +4,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from straightline.graph import Graph
-from straightline.limits import FEW
 from straightline.lowering import RULES, Lowering, type_of
 from straightline.nodes import REAL, Node, Unsupported
 from straightline.rules.elementwise import select
+from straightline.size_limits import FEW
 
 
 def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:

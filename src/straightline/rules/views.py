@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.limits import FEW, LOADED, TABLE
 from straightline.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, arrange_nodes, result_shape
-from straightline.memory import InMemory, contiguous_strides
 from straightline.nodes import Buffer, Node, RandomKey
 from straightline.rules.elementwise import PASSED_ON, select
+from straightline.rules.index_bounds import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_fill_value
 from straightline.rules.loops import copy_in_memory, put_in_memory, repeat_turns
-from straightline.rules.places import clamp_place, convert_to_32_bits, fills_outside, is_inside, make_filling
 from straightline.rules.shapes import select_array
+from straightline.size_limits import FEW, LOADED, TABLE
+from straightline.strided_arrays import StridedArray, contiguous_strides
 
-View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
+View = Callable[[StridedArray, Any, tuple[int, ...]], StridedArray | None]
 
 
 def _make_view_rule(name: str, view: View) -> Rule:
@@ -29,31 +29,31 @@ def _make_view_rule(name: str, view: View) -> Rule:
     return rule
 
 
-def _slice(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
     """Return a view from start to limit along each axis, by steps."""
     steps = params["strides"] or (1,) * x.ndim
     offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
     return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
 
 
-def _reverse(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
     """Return a view that goes backwards along some axes."""
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
     return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
 
 
-def _transpose(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+def _transpose(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
     """Return a view with the axes in another order."""
     return x.view(shape, [x.strides[a] for a in params["permutation"]])
 
 
-def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | None:
+def _reshape(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray | None:
     """Return a view of another shape; None if no strides describe it."""
     return x.view_in_shape(shape)
 
 
-def _broadcast_view(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+def _broadcast_view(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
     """Return a view that repeats an array in memory along new axes: strides of zero."""
     strides = [0] * len(shape)
     for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
@@ -75,7 +75,7 @@ def _lower_dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Va
     """Lower `dynamic_slice` of an array in memory to a view: starts that data decide become moves of its address."""
     sizes = equation.params["slice_sizes"]
     x = make_indexable(lowering, inputs[0], inputs[1:])
-    if not isinstance(x, InMemory):
+    if not isinstance(x, StridedArray):
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
@@ -115,7 +115,7 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     """
     nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
     places_are_known = all(n.op == "constant" for n in nodes)
-    if isinstance(x, InMemory) or places_are_known:
+    if isinstance(x, StridedArray) or places_are_known:
         return x
     flat = x.ravel().tolist()
     has_keys, is_table = any(isinstance(n, RandomKey) for n in flat), all(n.op == "constant" for n in flat)
@@ -133,18 +133,20 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
     indices = convert_to_32_bits(lowering, indices) if fills_outside(equation) else indices
     x = make_indexable(lowering, inputs[0], [indices])
     is_one_window = indices.size == len(numbers.start_index_map) and not numbers.operand_batching_dims
-    if not isinstance(x, InMemory) or not is_one_window:
+    if not isinstance(x, StridedArray) or not is_one_window:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     window, fits = _view_window(lowering, equation, x, indices.ravel().tolist())
     is_known_inside = fits.op == "constant" and fits.value
     if not fills_outside(equation) or is_known_inside:
         return [window]
     # A window that is not inside is filled with a value.
-    filling, nodes = make_filling(lowering, equation), lowering.nodes(window)
+    filling, nodes = make_fill_value(lowering, equation), lowering.nodes(window)
     return [arrange_nodes([select(lowering.graph, fits, n, filling) for n in nodes.ravel().tolist()], nodes.shape)]
 
 
-def _view_window(lowering: Lowering, equation: JaxprEqn, x: InMemory, starts: list[Node]) -> tuple[InMemory, Node]:
+def _view_window(
+    lowering: Lowering, equation: JaxprEqn, x: StridedArray, starts: list[Node]
+) -> tuple[StridedArray, Node]:
     """Return the window of a gather as a view in the result's shape, and the node of whether it is inside the array.
 
     starts: its first place along each axis of the operation's `start_index_map`; it is clamped to the array.
@@ -165,7 +167,7 @@ def _view_window(lowering: Lowering, equation: JaxprEqn, x: InMemory, starts: li
     return view.view(result_shape(equation), _match_strides(view, result_shape(equation))), fits
 
 
-def _match_strides(view: InMemory, shape: tuple[int, ...]) -> list[int]:
+def _match_strides(view: StridedArray, shape: tuple[int, ...]) -> list[int]:
     """Return strides of the same entries with axes of length 1 added."""
     rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
     items = iter(rest)
@@ -176,7 +178,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     """Concatenate along the first axis in new memory, along another axis row by row."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     # As nodes if the result is short, or if all that is in memory is known numbers, which stay known then.
-    arrays_in_memory = [x for x in inputs if isinstance(x, InMemory)]
+    arrays_in_memory = [x for x in inputs if isinstance(x, StridedArray)]
     are_known = all(x.buffer.kind == "table" and not x.moves and x.size <= LOADED for x in arrays_in_memory)
     if math.prod(shape) <= TABLE or are_known:
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
@@ -192,24 +194,24 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     return [join_arrays(lowering, inputs, shape)]
 
 
-def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
+def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> StridedArray:
     """Return arrays one after another in one buffer of this shape, which is that of their concatenation.
 
     An array that has a buffer of its own (`_is_whole_buffer`) is computed into it directly, all others are copied.
     """
     graph = lowering.graph
-    type = next(x for x in parts if isinstance(x, InMemory)).type
+    type = next(x for x in parts if isinstance(x, StridedArray)).type
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
     for x in parts:
-        if isinstance(x, InMemory) and _is_whole_buffer(x, graph.current):
-            buffer.take_in(x.buffer, start)
+        if isinstance(x, StridedArray) and _is_whole_buffer(x, graph.current):
+            buffer.place_buffer_inside(x.buffer, start)
         else:
             _copy_into(lowering, x, buffer, start)
         start += x.size
-    return InMemory.whole(buffer)
+    return StridedArray.of_whole_buffer(buffer)
 
 
-def _is_whole_buffer(x: InMemory, block: Any) -> bool:
+def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
     """Return whether an array is all of a buffer that this block fills and that has no place in another buffer."""
     buffer = x.buffer
     whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous_strides(x.shape)
@@ -219,11 +221,11 @@ def _is_whole_buffer(x: InMemory, block: Any) -> bool:
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     """Store an array into a buffer from a place on: entry by entry if short, else by a loop."""
     graph = lowering.graph
-    if x.size <= TABLE or not isinstance(x, InMemory):
+    if x.size <= TABLE or not isinstance(x, StridedArray):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):
             graph.store(buffer, node, start + index, (), ())
     else:
-        buffer.take_in(copy_in_memory(lowering, x).buffer, start)
+        buffer.place_buffer_inside(copy_in_memory(lowering, x).buffer, start)
 
 
 VIEWS: dict[str, View] = {

@@ -5,7 +5,7 @@ import math
 import jaxlib.version
 
 from straightline.vectors.exponential import exp_of_sum, find_format, log, log1p
-from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select, sqrt
+from straightline.vectors.formula_builder import Vector, copy_sign, fma, polynomial, select, sqrt
 
 # erf x = x + x P / Q in x^2, |x| < 27/32.
 CENTRE = (

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, select
+from straightline.vectors.formula_builder import Vector, copy_sign, fma, polynomial, select
 
 LOG2_E = 1 / math.log(2)
 
@@ -101,7 +101,7 @@ def log(x: Vector) -> Vector:
     is_subnormal, power = x < form.tiny, form.fraction + 2
     k, m = _split_exponent(select(is_subnormal, x * 2.0**power, x))
     value = _log(k - select(is_subnormal, x.like(power), 0.0), m - 1, 0.0)
-    return _set_outside_domain(x, value)
+    return _set_log_outside_domain(x, value)
 
 
 def log1p(x: Vector) -> Vector:
@@ -110,7 +110,7 @@ def log1p(x: Vector) -> Vector:
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _split_exponent(u)
     value = _log(k, m - 1, rounded / u)
-    return select(abs(x) < find_format(x).negligible, x, _set_outside_domain(u, value))
+    return select(abs(x) < find_format(x).negligible, x, _set_log_outside_domain(u, value))
 
 
 def tanh(x: Vector) -> Vector:
@@ -179,7 +179,7 @@ def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
     return fma(k, form.ln2[0], f - (half - fma(s, half + r, fma(k, form.ln2[1], more))))
 
 
-def _set_outside_domain(x: Vector, value: Vector) -> Vector:
+def _set_log_outside_domain(x: Vector, value: Vector) -> Vector:
     """Return a logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
     special = select(x.equals(0.0), -math.inf, select(x > 0.0, x, math.nan))
     return select((x > 0.0) & (x < math.inf), value, special)

@@ -3,7 +3,7 @@
 import math
 
 from straightline.vectors.exponential import find_format, round_to_nearest
-from straightline.vectors.formulas import Vector, copy_sign, fma, polynomial, rounded, select
+from straightline.vectors.formula_builder import Vector, copy_sign, fma, polynomial, rounded, select
 
 HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
 HALF_PI_OF_FLOATS = 1.5707963705062866, -4.371138828673793e-08, -1.7151244994428829e-15

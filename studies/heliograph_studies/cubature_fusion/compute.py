@@ -12,8 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero, square_root
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    decorrelate,
+    join_columns,
+    reciprocal_or_zero,
+    square_root,
+)
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
 from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from heliograph.numerics.check import fail, show_value
-from heliograph.numerics.process.extras import check_installed
+from heliograph.numerics.process.optional_packages import check_installed
 
 MOVING = 0.01  # m in one odometry row of 0.1 or 0.2 s: the robot has started
 LONGEST = 1.0  # s without a range after which the rows of the odometry are kept: a chord stands for a second at most

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from shutil import which
 
-from heliograph.numerics.process.extras import how_to_install
+from heliograph.numerics.process.optional_packages import how_to_install
 
 
 def find_server() -> str:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.factors.roots import covariance_of_root, roots_of
-from heliograph.linear.recursion import step_covariance, take_noise_roots
+from heliograph.factors.square_root_update import covariance_of_root, roots_of
+from heliograph.linear.lmmse_recursion import find_noise_roots, step_covariance_roots
 from heliograph.linear.system import LinearSystem, state_moments
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
@@ -74,7 +74,7 @@ def boundedness(system: LinearSystem, window: int | None = None) -> Boundedness:
     roots, size = [roots_of(system.covariance)], system.mean**2 + np.diag(system.covariance)
     for k in range(system.horizon):
         s = system.step(k)
-        roots.append(step_covariance(roots[-1], s, take_noise_roots(s, size)).root)
+        roots.append(step_covariance_roots(roots[-1], s, find_noise_roots(s, size)).root)
     values = np.linalg.eigvalsh(np.array([covariance_of_root(root) for root in roots]))
     low, high = float(values[1:, 0].min()), float(values[:, -1].max())
     lower = _lower(c, low)

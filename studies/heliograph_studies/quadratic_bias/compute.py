@@ -9,9 +9,9 @@ import numpy as np
 import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
 from heliograph.filters.linear.polynomial import MemoryFilter
-from heliograph.linear.lift import lifted_system
-from heliograph.linear.polynomial import quadratic_system_with_linear_estimate, skewness
-from heliograph.linear.recursion import lmmse, true_covariance
+from heliograph.linear.lmmse_recursion import lmmse, true_covariance
+from heliograph.linear.monomial_lifted_system import lifted_system
+from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate, skewness
 from heliograph.linear.system import LinearSystem, Schedule, state_moments
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.roots import observe_information, roots_of
+from heliograph.factors.square_root_update import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.paths.model import Paths, PlantSteps, compute_error_covariances, compute_path_information

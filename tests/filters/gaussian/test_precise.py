@@ -9,7 +9,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors import WeightedColumns, condition_on_observation, from_covariance
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from tests.follow import follow
 
 A, C = [[1, 1], [0, 1]], [[1, 0]]

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.moments import about_mean
-from heliograph.random_affine.moments.moment_noise import CentredNoise
+from heliograph.random_affine.moments.noise_from_moments import CentredNoise
 from heliograph.testing import check_filter
 from tests.follow import last
 

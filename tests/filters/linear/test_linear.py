@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.series_and_stack import Series
 
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
 SENSOR = hg.LinearSensor([[1.0, 0.0], [0.5, 1.0]], 0.02)

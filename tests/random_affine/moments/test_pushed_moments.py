@@ -13,7 +13,7 @@ from heliograph.random_affine.moments import (
     push_moments,
     push_through_known_map,
 )
-from heliograph.random_affine.noise import noise_vector
+from heliograph.random_affine.noise import noise_moment_vector
 from tests.random_affine.test_contract import CHANNELS
 
 
@@ -63,16 +63,16 @@ def test_a_table_knows_what_the_law_knows():
         [[1.0, 0.5], [0.0, 2.0]], hg.random_affine.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
     )
     table = TabulatedNoise(law, 4)
-    np.testing.assert_array_equal(noise_vector(table, 4), noise_vector(law, 4))
+    np.testing.assert_array_equal(noise_moment_vector(table, 4), noise_moment_vector(law, 4))
     assert all(table.moment(a) == law.moment(a) for k in range(5) for a in list_exponents(2, k))
 
 
 def test_a_large_order_needs_no_large_matrix():
     """16 states, order 4: the vector has 4845 entries; the matrix that is not formed has 23 million."""
     plant = hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), 0.5 * np.eye(16), 0.3)
-    gaussian = noise_vector(hg.Gaussian(np.eye(16)), 4)
+    gaussian = noise_moment_vector(hg.Gaussian(np.eye(16)), 4)
     assert len(gaussian) == count_monomials(17, 4) == 4845
-    expected = noise_vector(hg.Gaussian((0.25 + 0.3) * np.eye(16)), 4)
+    expected = noise_moment_vector(hg.Gaussian((0.25 + 0.3) * np.eye(16)), 4)
     np.testing.assert_allclose(push_moments(plant, 4, gaussian), expected, rtol=1e-12)
 
 

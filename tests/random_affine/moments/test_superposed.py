@@ -9,9 +9,9 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.moments import evaluate_monomials, second_moments, tensors
+from heliograph.random_affine.moments import evaluate_monomials, moment_tensors, second_moments
 from heliograph.random_affine.noise import FiniteSupport
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.sum_of_maps import Superposed
 
 FAIR = hg.Discrete([0.4, 1.3, -0.2], [0.5, 0.2, 0.3], 0.05)
 COIN = FiniteSupport([[1.0], [-0.5]], [1 / 3, 2 / 3])
@@ -95,7 +95,7 @@ def test_the_second_order_description_is_that_of_the_moments(name):
     nominal, seen = channel.moments(2), described(channel)
     tensor = nominal.second
     mean = nominal.mean[:-1]
-    spread = tensor - tensors.symmetric_product(mean, mean)
+    spread = tensor - moment_tensors.symmetric_product(mean, mean)
     np.testing.assert_allclose(np.column_stack([seen.mean_gain, seen.offset]), mean, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(seen.nominal.center, spread, rtol=1e-10, atol=1e-12)
 

@@ -10,9 +10,9 @@ import pytest
 
 from straightline.c_source import CSource, write_literal
 from straightline.lowering import list_nodes
-from straightline.memory import InMemory
 from straightline.nodes import Unsupported
 from straightline.program import lower_function
+from straightline.strided_arrays import StridedArray
 from tests.export.device import needs_compiler
 from tests.straightline.conformance.c import FLAGS
 
@@ -22,11 +22,11 @@ X = np.array([0.3, -1.7, 2.5, 0.9])
 def written(function, x, real="double"):
     """The statements, tables and results of a function of one array."""
     program = lower_function(function, x)
-    arrays = [x.nodes(program.graph) if isinstance(x, InMemory) else x for x in program.outputs]
+    arrays = [x.nodes(program.graph) if isinstance(x, StridedArray) else x for x in program.outputs]
     results = [node for array in arrays for node in list_nodes(array)]
     source = CSource(results, {program.inputs[0]: "x[{}]".format}, real, "made")
     body = source.write_statements(program.graph.top)
-    stores = [f"    out[{i}] = {source.name(node)};" for i, node in enumerate(results)]
+    stores = [f"    out[{i}] = {source.name_node(node)};" for i, node in enumerate(results)]
     return [*source.declarations(), *body, *stores], source.table_definitions(), len(results)
 
 

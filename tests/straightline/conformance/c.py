@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from straightline.c_source import CSource, c_type
-from straightline.folding import DTYPES
+from straightline.constant_folding import DTYPES
 from straightline.lowering import list_nodes
 from straightline.nodes import Unsupported
 from tests.straightline.conformance.case import Case
@@ -61,7 +61,8 @@ def _function(case: Case, name: str) -> tuple[str, str, list[tuple[str, tuple[in
     for flat, x in zip(nodes, program.outputs, strict=True):
         kind = flat[0].type if flat else x.type
         ends += [
-            f"    {{ {c_type(kind, 'double')} y = {source.name(n)}; fwrite(&y, sizeof y, 1, stdout); }}" for n in flat
+            f"    {{ {c_type(kind, 'double')} y = {source.name_node(n)}; fwrite(&y, sizeof y, 1, stdout); }}"
+            for n in flat
         ]
         types.append((kind, x.shape))
     lines = [f"static void {name}(void)", "{", *arrays, *source.declarations(), *body, *ends, "}"]

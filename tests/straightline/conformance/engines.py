@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from straightline.compiled import Compiled
-from straightline.limits import TABLE
+from straightline.compiled import CompiledFunction
 from straightline.lowering import Lowering, trace_function, type_of
-from straightline.memory import InMemory
 from straightline.nodes import Buffer
 from straightline.program import Program, lower_function
+from straightline.size_limits import TABLE
+from straightline.strided_arrays import StridedArray
 from tests.straightline.conformance.case import Case
 
 
@@ -32,7 +32,7 @@ def by_xla(cases: Sequence[Case]) -> list[list[np.ndarray]]:
 def by_lanes(case: Case) -> list[np.ndarray]:
     """By native code, each run a lane."""
     program = lower_function(lambda *row: jax.tree.leaves(case.function(*row)), *case.row(0))
-    return [np.asarray(x) for x in Compiled(program, [True] * len(case.arguments))(*case.arguments)]
+    return [np.asarray(x) for x in CompiledFunction(program, [True] * len(case.arguments))(*case.arguments)]
 
 
 def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> Program:
@@ -44,11 +44,13 @@ def program_of(cases: Sequence[Case], known: Sequence[bool] = (False,) * 4) -> P
         for argument, fixed in zip(case.arguments, known, strict=False):
             if not fixed:
                 inputs.append(Buffer("input", type_of(argument), argument.shape, lowering.graph.top))
-            columns.append(argument if fixed else InMemory.whole(inputs[-1]))
+            columns.append(argument if fixed else StridedArray.of_whole_buffer(inputs[-1]))
         rows: list[list[Any]] = []
         with jax.enable_x64(True):
             for run in range(case.runs):
-                row = [c.row(run) if isinstance(c, InMemory) else lowering.make_known_array(c[run]) for c in columns]
+                row = [
+                    c.row(run) if isinstance(c, StridedArray) else lowering.make_known_array(c[run]) for c in columns
+                ]
                 row = [lowering.nodes(x) if x.size <= TABLE else x for x in row]
                 rows.append(lowering.lower_whole_program(made, row))
         outputs += [_stacked(lowering, leaves) for leaves in zip(*rows, strict=True)]
@@ -60,14 +62,14 @@ def _stacked(lowering: Lowering, leaves: Sequence[Any]) -> Any:
     if leaves[0].size:
         return np.stack([lowering.nodes(x) for x in leaves])
     shape = (len(leaves), *leaves[0].shape)
-    return InMemory.whole(Buffer("scratch", leaves[0].type, shape, lowering.graph.top))
+    return StridedArray.of_whole_buffer(Buffer("scratch", leaves[0].type, shape, lowering.graph.top))
 
 
 def by_known(cases: Sequence[Case], known: Sequence[bool]) -> list[np.ndarray]:
     """By native code in one program of all runs, arguments known or not; the leaves of all cases one after another."""
     program = program_of(cases, known)
     data = [a[None] for case in cases for a, k in zip(case.arguments, known, strict=False) if not k]
-    return [x[0] for x in Compiled(program, [True] * len(data), 1)(*data)]
+    return [x[0] for x in CompiledFunction(program, [True] * len(data), 1)(*data)]
 
 
 def difference(result: np.ndarray, expected: np.ndarray, units: float) -> np.ndarray:

@@ -34,7 +34,7 @@ import numpy as np
 import pytest
 
 import straightline as sl
-from straightline.compiled import Compiled
+from straightline.compiled import CompiledFunction
 from straightline.lowering import IN_MEMORY, RULES, trace_function
 from straightline.nodes import Unsupported
 from tests.straightline.conformance import arrays, elementwise, matrices, programs
@@ -130,7 +130,7 @@ def taken(name: str, cases: list[Case]) -> list[Case]:
     kept = []
     for case in cases:
         try:
-            Compiled(program_of([thinned(case, 1)]), [True] * len(case.arguments))
+            CompiledFunction(program_of([thinned(case, 1)]), [True] * len(case.arguments))
         except Unsupported:
             continue
         kept.append(case)

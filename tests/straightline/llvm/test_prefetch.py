@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from straightline.compiled import compile
-from straightline.llvm.layout import WIDEST
+from straightline.llvm.memory_layout import WIDEST
 
 TURNS = 1200  # of so many a loop stays one
 SUMS = jax.ShapeDtypeStruct((TURNS, 2), np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from straightline import compile
-from straightline.limits import WRITTEN_OUT
+from straightline.size_limits import WRITTEN_OUT
 
 SIDE = 46
 RUNS = 9

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from straightline.compiled import compile
-from straightline.jax_function import make_jax_function
-from straightline.llvm.module import choose_output_buffers
+from straightline.graph_as_jax_function import make_jax_function
+from straightline.llvm.module_text import choose_output_buffers
 from straightline.nodes import Node
-from straightline.program import list_needed, lower_function
+from straightline.program import list_needed_items, lower_function
 
 RANDOM = np.random.default_rng(7)
 SPARSE = np.where(RANDOM.random((5, 5)) < 0.5, 0.0, RANDOM.normal(size=(5, 5)))
@@ -21,7 +21,7 @@ VALUES = np.array([np.nan, np.inf, -np.inf, 1.5, -2.0])
 def operations(function, *shapes):
     """Additions and products, and numbers that a loop carries, of a function of arrays of these shapes."""
     program = lower_function(function, *(jax.ShapeDtypeStruct(s, np.float64) for s in shapes))
-    nodes = [n for n in list_needed(choose_output_buffers(program)) if isinstance(n, Node)]
+    nodes = [n for n in list_needed_items(choose_output_buffers(program)) if isinstance(n, Node)]
     counts = Counter(n.op for n in nodes)
     return counts["add"] + counts["sub"] + counts["mul"], counts["parameter"]
 

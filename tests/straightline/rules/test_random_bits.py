@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from straightline.folding import DTYPES, EVALUATED
+from straightline.constant_folding import DTYPES, EVALUATED
 from straightline.lowering import list_nodes
 from straightline.nodes import Node, Unsupported
 from straightline.program import lower_function

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.numerics.process import extras
+from heliograph.numerics.process import optional_packages
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.recording import (
     PlazaRecording,
@@ -122,7 +122,7 @@ def test_a_beginning_keeps_the_start(recording: PlazaRecording) -> None:
 
 
 def test_missing_extra_is_one_line_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(optional_packages, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install .*\[recordings\]") as caught:
         find_recording()
     assert caught.value.name == "gtsam"

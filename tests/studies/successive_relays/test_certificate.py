@@ -7,7 +7,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine.laws.law import GivenMoments
 from heliograph.relays.design import local_error_design
-from heliograph.relays.receiver_error import receiver_error_design
+from heliograph.relays.design_for_receiver_error import receiver_error_design
 from heliograph_studies.successive_relays.certificate import certify_relays
 from tests.relays.relay_problems import example, unusual
 

@@ -1,5 +1,5 @@
 """Which field of which message is which number of a network."""
 
-from heliograph.numerics.names import lazy_names
+from heliograph.numerics.lazy_exports import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

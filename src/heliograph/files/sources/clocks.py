@@ -10,7 +10,7 @@ from heliograph.files.sources.fields import field_at
 from heliograph.files.sources.json_field import Source
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.dates import looks_like_date
-from heliograph.numerics.times.row_order import YEAR
+from heliograph.numerics.times.timestamp_order import YEAR
 
 
 @dataclass

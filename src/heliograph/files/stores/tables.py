@@ -14,7 +14,7 @@ from heliograph.files.rows import Rows
 from heliograph.files.stores.address import INFLUX, StoreAddress, parse_store
 from heliograph.files.table import TIME, columns_of
 from heliograph.numerics.check import fail, instance, text
-from heliograph.numerics.process.extras import check_installed
+from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.simulation.results.record import Record
 
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, eliminate, join_columns, zero_covariance
-from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate, join_columns, zero_covariance
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
 from heliograph.filters.truncation import CERTAIN

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.event.gaussian_sum import GaussianSum, safe_log
 
 

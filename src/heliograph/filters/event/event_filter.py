@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import Gaussian, append_rows, from_covariance, take_leading
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.belief import EventBelief
 from heliograph.filters.event.gaussian_sum import (

@@ -21,7 +21,7 @@ from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 

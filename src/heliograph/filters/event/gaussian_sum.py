@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     from_columns,
     merge_mixture,

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, below_diagonal, join_columns, rounding_of
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns, below_diagonal, join_columns, rounding_of
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     append_rows,
     condition_on_observation,
@@ -15,7 +15,7 @@ from heliograph.factors.gaussian import (
     sum_unexplained,
     take_leading,
 )
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.belief import image_of, process_noise
 from heliograph.filters.gaussian.signal import gain_noise, signal_of

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, eliminate, join_columns, zero_covariance
-from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate, join_columns, zero_covariance
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform

@@ -6,8 +6,8 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns, columns_of, join_columns, rounding_of, triangularise
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, join_columns, rounding_of, triangularise
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     Image,
     add_noise_to_image,

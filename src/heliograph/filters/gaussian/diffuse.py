@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import columns_of, triangularise
-from heliograph.factors.diffuse import (
+from heliograph.factors.covariance_factors import columns_of, triangularise
+from heliograph.factors.diffuse_gaussian import (
     Diffuse,
     as_gaussian,
     condition_on_next_diffuse,

@@ -18,7 +18,7 @@ from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.memory import is_modal
+from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import has_random_gain
 
 MATRICES = ", of matrices kalman_filter(*hg.state_space(F, H, Q, R, mean, covariance))"
@@ -259,7 +259,7 @@ def kalman_filter(
     """
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
-        modal = is_modal(first(plant)) or is_modal(first(sensor))
+        modal = is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor))
         instead = f" of one law ({SEVERAL_TAKEN_BY})" if modal else MATRICES
         raise fail("Kalman filter", f"a LinearPlant and a LinearSensor{instead}", got)
     if has_unknown_start(plant):

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, join_columns
-from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,

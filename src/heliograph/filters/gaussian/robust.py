@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, columns_of, zero_covariance
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of, zero_covariance
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     FilterAngles,

@@ -17,7 +17,7 @@ from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import ArrayLike
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns, join_columns
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     append_rows,
     condition_on_observation,
@@ -17,7 +17,7 @@ from heliograph.factors.gaussian import (
     impose_moments_of_combination,
     take_leading,
 )
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.robust_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 

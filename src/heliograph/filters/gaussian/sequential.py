@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import (
+from heliograph.factors.covariance_factors import (
     WeightedColumns,
     eliminate,
     join_columns,
@@ -17,8 +17,8 @@ from heliograph.factors.columns import (
     square_root,
     unit_of,
 )
-from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.factored_gaussian import Gaussian, Innovations, condition_on_observation
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant

@@ -9,8 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, decorrelate, eliminate, reciprocal_or_zero, square_root
-from heliograph.factors.gaussian import Gaussian, Image, from_covariance, image_by_slopes
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    decorrelate,
+    eliminate,
+    reciprocal_or_zero,
+    square_root,
+)
+from heliograph.factors.factored_gaussian import Gaussian, Image, from_covariance, image_by_slopes
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.trace_settings import evaluate_at_points

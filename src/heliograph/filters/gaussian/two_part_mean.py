@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import unit_of
-from heliograph.factors.two_part_mean import SplitMeanGaussian, center_gaussian, center_known
+from heliograph.factors.covariance_factors import unit_of
+from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
@@ -19,7 +19,7 @@ from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
 from heliograph.model.premises.premise import on_premise
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, wrap_angles
-from heliograph.numerics.compensated import Compensated, compensate, split_sum
+from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.noise import AbstractNoise
@@ -109,8 +109,9 @@ class CentredFilter(AbstractWrapper):
 
     The plant about a center c is e -> f(c + e) - c', of an origin c' after the step, the sensor e -> h(c + e) - y, and
     what is received z - M y: what the filter within sees is as large as its deviations, however far the center is.
-    Both are evaluated with what rounding takes (`numerics/compensated.py`); of linear ones F e + (F c - c') is that.
-    After each half of a step the mean c + e is c again as it is rounded, and e what is left.
+    Both are evaluated with what rounding takes (`numerics/compensated_arithmetic.py`); of
+    linear ones F e + (F c - c') is that. After each half of a step the mean c + e is c again as it is rounded, and e
+    what is left.
 
     A gain that is random acts on the whole signal: behind one y is 0.
 

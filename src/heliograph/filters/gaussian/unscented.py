@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns, square_root
-from heliograph.factors.gaussian import Gaussian, Image
+from heliograph.factors.covariance_factors import WeightedColumns, square_root
+from heliograph.factors.factored_gaussian import Gaussian, Image
 from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
@@ -14,7 +14,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import TINY, fail, scalar
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import ArrayLike, Float, Scalar
 
 ROUNDING = 1e-12  # relative, of a condition on parameters that holds with equality

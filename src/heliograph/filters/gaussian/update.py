@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.bounds import (
     Scalars,
     as_scalars,
@@ -27,14 +27,14 @@ from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Discrete
-from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.moment_tensors import symmetric_product
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import (
     SecondOrder,
     describe_second_moments,
     nominal_spread,
     second_order,
 )
-from heliograph.random_affine.moments.tensors import symmetric_product
 
 
 @readable

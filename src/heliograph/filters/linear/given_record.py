@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.gaussian import from_covariance
+from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant

@@ -40,10 +40,10 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
-from heliograph.random_affine.memory import is_modal
+from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
-from heliograph.random_affine.outliers import has_bounded_noise
-from heliograph.random_affine.words.rounded import find_rounded
+from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.words.rounding_noise import find_rounded_noises
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -114,7 +114,7 @@ class LinearFilter(AbstractSizedFilter):
     def has_known_gain(self) -> bool:
         """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
         whole = stacked(self.channel)
-        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
+        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded_noises(self.sensor))
 
     def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
@@ -222,13 +222,13 @@ def linear_filter(
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
     # Memory: the modes are estimated jointly with the state. A sensor that rounds may lower the claim.
-    if first(channel).remembers or is_modal(first(plant)) or is_modal(first(sensor)):
+    if first(channel).remembers or is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
+        return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded_noises(sensor) else filter
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
@@ -250,7 +250,7 @@ def linear_filter(
 
 def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
     """Return the filter that estimates the modes of links, plant and sensor jointly with the state."""
-    if is_modal(first(plant)) or is_modal(first(sensor)):
+    if is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         return _make_jump_system_filter(plant, sensor, channel)
     if first(channel).erases:
         return modes.side_information_filter(plant, sensor, channel)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compute_once
-from heliograph.engine.limits import SHORT
+from heliograph.engine.size_thresholds import SHORT
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
@@ -15,7 +15,7 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import in_float64, quickly_compiled
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 

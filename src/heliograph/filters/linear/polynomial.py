@@ -13,10 +13,10 @@ from heliograph.filters.linear.mean_before_data import UnconditionalMean, centre
 from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.linear.lift import lifted_system
-from heliograph.linear.polynomial import quadratic_system_with_linear_estimate
-from heliograph.linear.recursion import lmmse
-from heliograph.linear.step_maps import check_model
+from heliograph.linear.lmmse_recursion import lmmse
+from heliograph.linear.monomial_lifted_system import lifted_system
+from heliograph.linear.plant_and_measurement_maps import check_model
+from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
@@ -28,11 +28,11 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.gaussian_density import log_density
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import check_forgets, check_maps
 from heliograph.random_affine.moments.monomials import count_monomials, evaluate_monomials, position
-from heliograph.random_affine.outliers import has_bounded_noise
+from heliograph.random_affine.outlier_noise import has_bounded_noise
 
 
 class CentredState(NamedTuple):

@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns, rounding_of, triangularise
-from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    factor_covariances,
+    join_columns,
+    rounding_of,
+    triangularise,
+)
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.signal import condition_on_measurement
 from heliograph.filters.innovation import gaussian_innovation

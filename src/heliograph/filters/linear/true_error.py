@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep, PlannedFilter
 from heliograph.filters.modes.modal import ChannelByMode, channels_by_mode
-from heliograph.linear.jump_system import mix_modes, propagate_by_mode
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.enlarged.past_outputs import with_past
 from heliograph.model.over_time import at, first
@@ -134,7 +134,7 @@ def _propagate_moments(
     move[:n, n] = plant.shift(inputs)
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(inputs)
-    before = mix_modes(rows, moments)
+    before = mix_moments_of_modes(rows, moments)
     return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
 
 

@@ -19,8 +19,14 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, join_columns, rounding_of, side_by_side, triangularise
-from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    join_columns,
+    rounding_of,
+    side_by_side,
+    triangularise,
+)
+from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
@@ -44,7 +50,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.superposed import split_terms_without_common_memory
+from heliograph.random_affine.sum_of_maps import split_terms_without_common_memory
 
 Terms = tuple[ChannelByMode | OverTime, ...]  # of a sum, each with modes of its own
 Laws = tuple[jax.Array, ...]  # of the modes of each term

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.modes import JointModes
+from heliograph.random_affine.moments.moment_tensors import symmetric_product
 from heliograph.random_affine.moments.second_moments import join_gain_and_noise, split_off_noise
-from heliograph.random_affine.moments.tensors import symmetric_product
 
 
 class SideInformation(Module):

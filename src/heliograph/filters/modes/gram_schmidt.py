@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import reciprocal_or_zero
+from heliograph.factors.covariance_factors import reciprocal_or_zero
 from heliograph.numerics.linalg import outer
 
 

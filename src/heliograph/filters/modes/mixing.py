@@ -8,7 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, from_covariance_by_elimination, merge_mixture, moments_of_mixture
+from heliograph.factors.factored_gaussian import (
+    Gaussian,
+    from_covariance_by_elimination,
+    merge_mixture,
+    moments_of_mixture,
+)
 from heliograph.filters.gaussian.belief import predict_gaussian, process_noise
 from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.model.plant import AbstractPlant, LinearPlant

@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns, rounding_of, square_root
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    factor_covariances,
+    join_columns,
+    rounding_of,
+    square_root,
+)
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     condition_on_observation,
     from_covariance,
@@ -39,15 +45,15 @@ from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, stack_parts
+from heliograph.numerics.numpy_or_jax import is_traced, stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.mixture_components import COMPONENT_LIMIT
+from heliograph.random_affine.series_and_stack import Series
 
 
 class AtomCombinations(Module):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import (
+from heliograph.factors.covariance_factors import (
     WeightedColumns,
     below_diagonal,
     join_columns,
@@ -27,7 +27,7 @@ from heliograph.factors.columns import (
     side_by_side,
     triangularise,
 )
-from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
@@ -42,7 +42,7 @@ from heliograph.filters.modes.linear_by_mode import (
 )
 from heliograph.filters.modes.models_by_mode import find_models
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.linear.jump_system import mix_modes, propagate_by_mode
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import models_of
@@ -51,9 +51,9 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import stack_parts
+from heliograph.numerics.numpy_or_jax import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
 
@@ -178,7 +178,7 @@ class ModalFilter(AbstractJointModalFilter):
         Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
         """
         rows = self._transition_matrix(state, k)
-        arriving, motion = mix_modes(rows, state.moments), self._motion(state, u, k)
+        arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
         law = arriving[:, -1, -1]
         # F zeta about the moving centre.
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
@@ -220,7 +220,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
         """Return how the state moves about its centre in each mode of the step."""
-        arriving = mix_modes(self._transition_matrix(state, k), state.moments)
+        arriving = mix_moments_of_modes(self._transition_matrix(state, k), state.moments)
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:

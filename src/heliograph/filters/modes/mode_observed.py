@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.update import Polytope
@@ -28,9 +28,9 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memory import condition_on_memories, memories
+from heliograph.random_affine.memories_of_channels import condition_on_memories, memories
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.moments.quadratic_map import QuadraticMap
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments, nominal_spread
 
 

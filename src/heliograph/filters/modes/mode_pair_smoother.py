@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, unit_lower
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, unit_lower
+from heliograph.factors.factored_gaussian import (
     BackwardGain,
     Gaussian,
     condition_on_next_state,

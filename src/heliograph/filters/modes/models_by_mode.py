@@ -14,7 +14,7 @@ from heliograph.model.over_time import OverTime, first, restack, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, instance
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 
 

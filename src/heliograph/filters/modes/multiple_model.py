@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import (
     BackwardGain,
     Gaussian,
     from_covariance,

@@ -10,7 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.gaussian import Gaussian, from_covariance, moments_of_mixture
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, moments_of_mixture
 from heliograph.filters.base import (
     AbstractSizedFilter,
     FilterAngles,
@@ -49,7 +49,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import check_count
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 FEW = 300  # particles of modes
 NODES = 9  # modes that stand for a gain that drifts: they cost no more than few

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import (
+from heliograph.factors.covariance_factors import (
     WeightedColumns,
     below_diagonal,
     join_columns,
@@ -21,7 +21,7 @@ from heliograph.factors.columns import (
     unit_lower,
     unit_of,
 )
-from heliograph.factors.gaussian import Innovations, from_covariance
+from heliograph.factors.factored_gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
@@ -46,7 +46,7 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.linalg import outer
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import joint_modes
 
 

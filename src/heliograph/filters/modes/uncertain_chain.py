@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, join_columns, triangularise
-from heliograph.factors.gaussian import Gaussian, from_columns
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns, triangularise
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
 from heliograph.filters.gaussian.signal import factor_spread
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition

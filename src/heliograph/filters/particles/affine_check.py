@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend import core
 
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.traced import called_program
+from heliograph.numerics.numpy_or_jax import called_program
 
 KNOWN, GIVEN, AFFINE, OTHER = -1, 0, 1, 2  # degrees, in their order
 MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.particles.moments import FirstSums, StateSums, second_sums
 from heliograph.filters.particles.resampling import effective_number
 from heliograph.numerics.angle import Angles, wrap_angles

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import decorrelate, square_root
-from heliograph.factors.gaussian import Gaussian
-from heliograph.factors.repeated import rounding_of_products
+from heliograph.factors.covariance_factors import decorrelate, square_root
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.factors.repeated_measurements import rounding_of_products
 from heliograph.numerics.gaussian_density import LOG_TURN
 
 

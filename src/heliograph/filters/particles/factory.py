@@ -15,7 +15,7 @@ from heliograph.model.over_time import first, list_steps, restack, steps_covered
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance, items, scalar
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 

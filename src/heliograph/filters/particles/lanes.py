@@ -171,7 +171,7 @@ def _bind_in_place(
     `differs` says which arguments have an entry for each run. None without native code.
     """
     code = _bind(function, filter, arguments, differs)
-    return None if code is None else code.for_runs(runs, dict(enumerate(jax.tree.leaves(arguments))))
+    return None if code is None else code.make_in_place_code(runs, dict(enumerate(jax.tree.leaves(arguments))))
 
 
 def _bind(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
@@ -179,7 +179,7 @@ def _bind(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tupl
     choice = choose_code(function, (filter, *arguments), [False, *differs])
     if choice.code is None:
         return None
-    return choice.code.with_first(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
+    return choice.code.with_first_arguments(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
 
 
 def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:

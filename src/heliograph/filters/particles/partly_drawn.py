@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns
-from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
+from heliograph.factors.covariance_factors import WeightedColumns, factor_covariances, join_columns
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.factors.columns import WeightedColumns, columns_of
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of
 from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_uniforms
 from heliograph.model.plant import AbstractPlant

@@ -12,13 +12,13 @@ from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import fail
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, ArrivalOutcome
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.moments.mixture_components import AffineComponent
+from heliograph.random_affine.series_and_stack import Series
 
 CERTAIN = 1e-14  # of the largest eigenvalue of a noise's correlations: below it a combination has no noise
 

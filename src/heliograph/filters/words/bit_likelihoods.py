@@ -14,13 +14,13 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import Constant
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.modes import ModeOutput, Modes
-from heliograph.random_affine.words.flips import Flips
+from heliograph.random_affine.series_and_stack import Series, Stack
+from heliograph.random_affine.words.bit_flips import Flips
 
 MOST = 64  # combinations of error rates
 

@@ -22,11 +22,11 @@ from heliograph.model.words.encoder import Dither, Words
 from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.delay import Delayed
+from heliograph.random_affine.delay import DelayedLink
 from heliograph.random_affine.modes import ModeOutput
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded_noises
 
 
 class WordAlphabet(NamedTuple):
@@ -42,7 +42,7 @@ class WordAlphabet(NamedTuple):
 def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
     """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
     m = len(sensor.outputs)
-    rounded = find_rounded(sensor)
+    rounded = find_rounded_noises(sensor)
     if encoder is not None:
         instance("encoder", encoder, Words, "Words").check_outputs(m)
         if rounded:
@@ -118,7 +118,7 @@ def word_filter(
     start = check_plant(plant)
     check_sensor(first(sensor), len(start.states))
     # Behind a constant delay: the filter of the past, predicted to the present.
-    if isinstance(channel, Delayed) and channel.constant and not channel.timestamped:
+    if isinstance(channel, DelayedLink) and channel.constant and not channel.timestamped:
         return late_filter(word_filter(plant, sensor, channel.link, encoder, transform, hypotheses), channel.past)
     channel = perfect(len(first(sensor).outputs)) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states), late=True)

@@ -28,7 +28,7 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.words.rounded import RoundedNoise, find_rounded
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded_noises
 
 SEEN = 0.01  # share of the rms error that overload may change a claim by
 MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
@@ -143,7 +143,7 @@ def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) 
     if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
         expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
         raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
-    if find_rounded(sensor):
+    if find_rounded_noises(sensor):
         raise fail(
             "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
         )

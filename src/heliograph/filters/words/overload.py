@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.linear.recursion import lmmse
+from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, steps_covered, unstack
@@ -19,7 +19,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
-from heliograph.random_affine.words.rounded import RoundedNoise
+from heliograph.random_affine.words.rounding_noise import RoundedNoise
 
 STEPS = 500  # that are looked at, if the models do not end before
 MOST = 1e-3  # probability of an overload at a step that is not refused

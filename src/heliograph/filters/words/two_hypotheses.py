@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import join_columns, rounding_of
-from heliograph.factors.gaussian import (
+from heliograph.factors.covariance_factors import join_columns, rounding_of
+from heliograph.factors.factored_gaussian import (
     Gaussian,
     append_rows,
     impose_moments_of_combination,
@@ -16,7 +16,7 @@ from heliograph.factors.gaussian import (
     moments_of_mixture,
     take_leading,
 )
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
 from heliograph.filters.smoother_step import SmootherStep, StepTrace

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, join_columns, rounding_of
-from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns, rounding_of
+from heliograph.factors.factored_gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
@@ -27,7 +27,7 @@ from heliograph.model.words.encoder import Dither
 from heliograph.model.words.word_channel import FLAG
 from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.random_affine.words.rounded import LARGEST
+from heliograph.random_affine.words.rounding_noise import LARGEST
 
 OFF = 1e-6  # steps by which a received number may miss a word
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.gaussian import Gaussian, correct_by_gain
+from heliograph.factors.factored_gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.factories import gaussian_filter_of

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.filters.base import (
     AbstractFilter,
     Step,
@@ -36,10 +36,10 @@ from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps
-from heliograph.random_affine.combine import Series
-from heliograph.random_affine.delay import Delayed, Relayed, place_on_delay_line, signal_size
+from heliograph.random_affine.delay import DelayedLink, RelayedLinks, place_on_delay_line, signal_size
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.series_and_stack import Series
 
 
 class PartFilter(AbstractWrapper):
@@ -139,7 +139,7 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, received_line: Re
 
 
 def enlarge_by_relays(
-    plant: AnyPlant, sensor: AnySensor, channel: Relayed
+    plant: AnyPlant, sensor: AnySensor, channel: RelayedLinks
 ) -> tuple[AnyPlant, LinearSensor, Channel, tuple[RelayLine, ...]]:
     """Enlarge the plant by all lines of past signals, the sensor's first and then each relay's.
 
@@ -175,7 +175,7 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
     return append_driving_plant(plant, line, np.zeros((len(plant.states), held)))
 
 
-def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
+def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
     """Build the filter behind relays from `base`, the filter of all lines."""
     # Only the moments under known probabilities make the filter optimal.
     links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
@@ -319,18 +319,18 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
     """
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
-    if isinstance(start, Delayed) and start.timestamped:
+    if isinstance(start, DelayedLink) and start.timestamped:
         return _build_known_delay_filter(plant, sensor, channel, make)
-    if isinstance(channel, Delayed) and channel.constant:
+    if isinstance(channel, DelayedLink) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
-    if isinstance(start, Relayed):
+    if isinstance(start, RelayedLinks):
         return _build_behind_relays(plant, sensor, channel, make)
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
 
 
 def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> RelayLinesFilter:
     """Build the filter behind relays that store what they received."""
-    if not isinstance(channel, Relayed):
+    if not isinstance(channel, RelayedLinks):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
     larger, last, link, lines = enlarge_by_relays(plant, sensor, channel)
     return relayed_filter(plant, channel, make(larger, last, link), lines)
@@ -338,7 +338,7 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
 
 def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
     """Build the filter that receives each value's delay with it, with the channel's moments at every delay."""
-    if not isinstance(channel, Delayed):
+    if not isinstance(channel, DelayedLink):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
     larger, past_signals, _ = with_past(plant, sensor, channel)
@@ -360,6 +360,6 @@ def deliver_line_as_current(channel: Channel) -> Channel:
 def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the channel as if nothing were late: the present signal stands on every place of its delay line."""
     check_maps("channel", [channel])
-    if isinstance(channel, Relayed):
+    if isinstance(channel, RelayedLinks):
         return Series([_deliver_at_once(stage) for stage in channel.stages])
     return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), place_on_delay_line(channel)])

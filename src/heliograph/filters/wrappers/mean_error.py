@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import from_covariance
+from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.linear.linear import LinearFilter
@@ -17,13 +17,13 @@ from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import compile_in_float64
-from heliograph.numerics.times.data_rows import check_rows
+from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.chain import AbstractMemory, MarkovChain
+from heliograph.random_affine.channel_state_information import FreshNumbers, FreshReading, list_told_maps
 from heliograph.random_affine.laws.gain_given_reading import gain_quadrature, reading_quadrature
 from heliograph.random_affine.laws.law import AbstractLaw
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, MarkovChain
 from heliograph.random_affine.noise import FiniteSupport
-from heliograph.random_affine.reported_law import FreshNumbers, FreshReading, told_maps
 
 MOST = 20_000  # combinations of numbers that are summed over
 
@@ -132,7 +132,7 @@ def _list_contexts(filter: ToldFilter) -> ToldContexts:
     A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all
     combinations over the maps that tell some may come.
     """
-    memories = [affine.memory for affine in told_maps(first(filter.link))]
+    memories = [affine.memory for affine in list_told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:
         varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step

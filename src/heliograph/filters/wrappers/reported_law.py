@@ -32,17 +32,17 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.random_affine.reported_law import (
-    believe_told,
-    make_certain,
+from heliograph.random_affine.channel_state_information import (
+    condition_on_told_numbers,
+    list_told_maps,
+    list_told_numbers_of_outputs,
+    make_laws_certain,
     numbers_give_law,
-    numbers_of_outputs,
-    told_maps,
 )
+from heliograph.random_affine.moments.second_moments import second_order
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
@@ -154,13 +154,13 @@ class ToldFilter(AbstractWrapper):
         """Return values and numbers of a message; no value where a number is missing that it needs."""
         numbers = z[np.array(self.numbers)]
         suffices = ~jnp.isnan(numbers) | self._may_be_missing
-        is_usable = jnp.all(suffices | ~numbers_of_outputs(first(self.link)), axis=1)
+        is_usable = jnp.all(suffices | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
         return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
     def _may_be_missing(self) -> jax.Array:
         """True for the numbers that may be missing, of all that are told (numbers,)."""
-        return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
+        return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in list_told_maps(first(self.link))])
 
     def _filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
         """Build the filter of the law that the numbers give, and tell whether they give one.
@@ -168,9 +168,11 @@ class ToldFilter(AbstractWrapper):
         Where a number is missing that must not, it is that of a typical law.
         """
         link = at(self.link, k)
-        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in told_maps(link)])
+        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
-        return self.make(self.plant, at(self.sensor, k), believe_told(link, complete)), numbers_give_law(link, complete)
+        return self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete)), numbers_give_law(
+            link, complete
+        )
 
 
 def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
@@ -198,10 +200,10 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
-    link = at_each_step(lambda channel: make_certain(separate_told(channel).link), channel)
+    link = at_each_step(lambda channel: make_laws_certain(separate_told(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
-    if any(affine.reservation for affine in told_maps(first(link))):
+    if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
         claim = weakest([claim, "nominal"])
     # Rows of z in which the link's values and the told numbers stand.
     _, values, numbers = separate_told(first(channel))
@@ -222,8 +224,8 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
 @in_float64
 def believe_typical(link: PyTree) -> PyTree:
     """Return a link as it is for typical numbers."""
-    typical = [affine.typical for affine in told_maps(link)]
-    return believe_told(link, library(typical).concatenate(typical))
+    typical = [affine.typical for affine in list_told_maps(link)]
+    return condition_on_told_numbers(link, library(typical).concatenate(typical))
 
 
 def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:

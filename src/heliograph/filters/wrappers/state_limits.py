@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 import heliograph.filters.particles as particles
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import (
     AbstractFilter,
     AbstractSizedFilter,

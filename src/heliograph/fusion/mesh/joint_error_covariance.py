@@ -13,7 +13,7 @@ import scipy
 
 from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.linear.jump_system import propagate_by_mode
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float, Int
 
 

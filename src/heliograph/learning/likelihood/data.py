@@ -8,8 +8,8 @@ import numpy as np
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import check_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, check_columns, fail, show_value
-from heliograph.numerics.masked import fill_masked
-from heliograph.numerics.times.data_rows import check_rows
+from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 

@@ -8,14 +8,14 @@ import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
-from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
 from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.model.checks.row_times import check_dates
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.data_rows import check_rows
+from heliograph.numerics.times.data_row_checks import check_rows
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.laws.law import AbstractLaw, Discrete

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import expit
 
 from heliograph.numerics.check import Domain, fail
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, PyTree
 
 

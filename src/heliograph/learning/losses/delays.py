@@ -7,7 +7,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.numerics.check import TINY, array, fail, scalar
-from heliograph.numerics.counted_shares import Share, count_independent, wilson
+from heliograph.numerics.confidence_intervals import Share, count_independent, wilson
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import Discrete

@@ -9,11 +9,11 @@ from heliograph.learning.losses.probability_intervals import estimate_shares, lo
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
-from heliograph.numerics.counted_shares import Share, wilson
+from heliograph.numerics.confidence_intervals import Share, wilson
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
 
 Law = TypeVar("Law", bound="AbstractLossLaw")
 Packets = Float[np.ndarray, " packets"]

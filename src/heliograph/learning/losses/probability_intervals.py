@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, logit
 
-from heliograph.numerics.counted_shares import Share as Share
+from heliograph.numerics.confidence_intervals import Share as Share
 
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
 # The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.

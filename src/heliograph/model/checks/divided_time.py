@@ -11,7 +11,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 
 CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, in the plant's own unit
 TOLERANCE = 1e-9  # relative: a few products lose 1e-15

@@ -12,7 +12,7 @@ from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInp
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float, rename
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 

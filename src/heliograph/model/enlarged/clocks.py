@@ -13,7 +13,7 @@ from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
 from heliograph.numerics.module import readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float, rename
 from heliograph.random_affine.noise import AbstractNoise, Matrix
 

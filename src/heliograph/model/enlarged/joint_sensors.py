@@ -14,7 +14,7 @@ from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sen
 from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import fail, instance, names, table
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import rename
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 

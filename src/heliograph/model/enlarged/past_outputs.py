@@ -10,7 +10,7 @@ from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import rename
 from heliograph.random_affine.delay import place_on_delay_line
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Shaped

@@ -22,16 +22,16 @@ from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.module import are_same
-from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
+from heliograph.numerics.numpy_or_jax import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Series
 from heliograph.random_affine.erasure import second_moments
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.laws.law import Constant
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.noise import AbstractNoise
-from heliograph.random_affine.outliers import has_bounded_noise
+from heliograph.random_affine.outlier_noise import has_bounded_noise
+from heliograph.random_affine.series_and_stack import Series
 
 PLANT, SENSOR, CHANNEL, TRIGGER, RELAYS = "plant", "sensor", "channel", "trigger", "relays"
 RANGE = "range of values"

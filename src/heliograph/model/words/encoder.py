@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.model.trigger import one_of
 from heliograph.numerics.check import array, check_count, fail, rank, scalar, text
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, Float
 
 Dither = Literal["none", "triangular", "subtracted", "stochastic"]

@@ -14,13 +14,13 @@ from heliograph.model.over_time import at_each_step, first
 from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
-from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.composite import AbstractUniform
-from heliograph.random_affine.delay import Delayed, DelayLine, signal_size
+from heliograph.random_affine.composite import AbstractOneOfSeveralMaps
+from heliograph.random_affine.delay import DelayedLink, DelayLine, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.hop import GainAndNoise, known
 from heliograph.random_affine.modes import ModeOutput
-from heliograph.random_affine.words.flips import Flips
+from heliograph.random_affine.series_and_stack import Series, Stack
+from heliograph.random_affine.words.bit_flips import Flips
 
 FLAG = -1  # in the place of a component: a number that is no word
 Places = tuple[int, ...]  # of words: the component that each carries
@@ -122,13 +122,13 @@ def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> 
             parts = [_rewrite_map(part, places, form) for part in link.maps]
             places_of_all = tuple(place for part in parts for place in part.places)
             return RewrittenMap(Stack([part.map for part in parts]), places_of_all)
-        case AbstractUniform():
+        case AbstractOneOfSeveralMaps():
             return _rewrite_choice(link, places, form)
         case Erasure() | DelayLine():
             (inner,) = inner_maps(link)
             rewritten = _rewrite_map(inner, places, form)
             return RewrittenMap(replace_inner_maps(link, [rewritten.map]), rewritten.places)
-        case Delayed() if not link.timestamped:  # the choice of what is late, then the link
+        case DelayedLink() if not link.timestamped:  # the choice of what is late, then the link
             chosen = _rewrite_map(link.delay, places, form)
             rewritten = _rewrite_map(link.link, chosen.places, form)
             maps = [chosen.map if inner is link.delay else rewritten.map for inner in inner_maps(link)]
@@ -156,7 +156,7 @@ def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMa
     return RewrittenMap(Series(maps), places)
 
 
-def _rewrite_choice(link: AbstractUniform, places: Places, form: WordForm) -> RewrittenMap:
+def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordForm) -> RewrittenMap:
     """Return a choice among several maps, rewritten; raise ValueError unless all deliver the same components."""
     parts = [_rewrite_map(part, places, form) for part in link.maps]
     if len({part.places for part in parts}) > 1:

@@ -115,7 +115,7 @@ def _format_offset(zone: str | None) -> str:
 
 
 def parse_instant(text: str) -> datetime:
-    """Return a date of ISO 8601 with its zone, to the microsecond."""
+    """Return a date of ISO 8601 with its zone, to the microsecond; a ValueError without words if it has no zone."""
     match, leap = _match_date(text)
     if match["zone"] is None:
         raise ValueError

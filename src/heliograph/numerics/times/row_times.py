@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 
 from heliograph.numerics.check import array, fail, show_value
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
+from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import ArrayLike
 
 NANOSECONDS = np.dtype("datetime64[ns]")
@@ -30,7 +30,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     """
     clock = read_dates(name, value)
     if clock is None:
-        if not is_traced(value) and _holds_words(value):
+        if not is_traced(value) and _holds_texts_or_spans(value):
             raise fail(name, "numbers, or dates (datetime64, datetimes, texts of ISO 8601)", show_value(value))
         clock = array(name, value, (count,))
         whole = np.asarray(value)
@@ -45,7 +45,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
     return clock
 
 
-def _holds_words(value: object) -> bool:
+def _holds_texts_or_spans(value: object) -> bool:
     """Test whether a value is of texts or spans of time; a list of unequal lists is not."""
     try:
         return np.asarray(value).dtype.kind in "mSU"
@@ -122,12 +122,12 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
     if labels is None or callable(labels):  # a list has a function of that name
         return None
     shown = np.asarray(labels)
-    if shown.dtype.kind != "M" and not (shown.ndim == 1 and len(shown) and all(_is_moment(part) for part in shown)):
+    if shown.dtype.kind != "M" and not (shown.ndim == 1 and len(shown) and all(_is_date_label(part) for part in shown)):
         return None
     return check_times(f"dates of {name}", labels, len(shown))
 
 
-def _is_moment(part: object) -> bool:
+def _is_date_label(part: object) -> bool:
     """Return whether a label is a date: of a class of dates, or a text that reads as one."""
     if isinstance(part, str):
         return looks_like_date(part)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.roots import observe_root, roots_of
+from heliograph.factors.square_root_update import observe_root, roots_of
 from heliograph.linear.jump_system import JumpSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float

@@ -32,11 +32,11 @@ from heliograph.planning.plant_moments import (
 )
 from heliograph.planning.transmitters import compute_powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import find_stationary_law
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.markov_chain_and_autoregression import find_stationary_law
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
 from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
+from heliograph.random_affine.series_and_stack import Stack
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_information, roots_of
 from heliograph.linear.jump_system import JumpSystem
 from heliograph.model.plant import LinearPlant
 from heliograph.numerics.check import array, covariance, fail, instance, names, rank

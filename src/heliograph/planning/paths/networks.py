@@ -19,9 +19,9 @@ from heliograph.planning.plant_moments import (
 )
 from heliograph.planning.transmitters import compute_sent_powers
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.mixture import Mixture
+from heliograph.random_affine.series_and_stack import Stack
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

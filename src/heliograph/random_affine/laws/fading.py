@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from heliograph.numerics.check import scalar
-from heliograph.numerics.traced import library, plain, scipy_for
+from heliograph.numerics.numpy_or_jax import library, plain, scipy_for
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.laws.law import NATS, AbstractLaw, Scalar, Vector
 
@@ -59,7 +59,7 @@ class Rician(AbstractLaw):
 
     def moment(self, order: int) -> float | jax.Array:
         """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
-        shape = _evaluate_laguerre(order, ((self.sight / self.scale) ** 2) / 2)
+        shape = _evaluate_half_order_laguerre(order, ((self.sight / self.scale) ** 2) / 2)
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
 
     def quantile(self, probability: Vector) -> np.ndarray:
@@ -79,20 +79,20 @@ class Rician(AbstractLaw):
         return library(self.sight, self.scale).maximum(self.sight - reach, 0.0), self.sight + reach
 
 
-def _evaluate_laguerre(order: int, x: Scalar) -> Scalar:
-    """Return L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
+def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
+    """Return the Laguerre function L_v(-x) = 1F1(-v; 1; -x) of order v = `twice_order` / 2 >= 0 at -x <= 0.
 
-    Even orders are polynomials, from L_0 = 1; odd ones start from exponentially scaled Bessel functions,
-    L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the
-    difference loses no digits.
+    By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
+    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) =
+    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits.
     """
-    if order % 2:
+    if twice_order % 2:
         bessel = scipy_for(x).special
         before = bessel.i0e(x / 2)
         now, v = (1 + x) * before + x * bessel.i1e(x / 2), 0.5
     else:
         before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
-    while v < order / 2:
+    while v < twice_order / 2:
         before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
     moment: Scalar = now
     return moment

@@ -17,7 +17,7 @@ GRID = 33  # points among which the mode, and then each end, is looked for
 ZOOMS = 12  # times that the grid shrinks to two of its cells: by (2 / 32)^12, to the last bit
 
 
-class GivenReading(AbstractLaw):
+class GainLawGivenReading(AbstractLaw):
     """Law of a gain given a reading of it, known by its mean and variance.
 
     Args:
@@ -40,7 +40,7 @@ class GivenReading(AbstractLaw):
         return powers[order]
 
 
-def check_density(law: AbstractLaw) -> AbstractLaw:
+def require_density(law: AbstractLaw) -> AbstractLaw:
     """Return a law of which readings can be used: one with a density, or of finitely many values.
 
     Raises:
@@ -73,7 +73,7 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
         return Discrete(law.values, jnp.where(known, jax.nn.softmax(log_density), law.probabilities))
     mean, spread = _integrate_posterior(law, a, jnp.asarray(variance))
     own_mean, own_square = law.moment(1), law.moment(2)
-    return GivenReading(
+    return GainLawGivenReading(
         mean=jnp.where(known, mean, own_mean), variance=jnp.where(known, spread, own_square - own_mean**2)
     )
 
@@ -110,7 +110,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     low = from_gain(jnp.minimum(low, a - 9 * deviation))
     high = from_gain(jnp.maximum(high, a + 9 * deviation))
     # The part of these that does count: within NATS of the mode.
-    mode = _find_mode(log_density, low, high)
+    mode = _find_density_mode(log_density, low, high)
     least = log_density(mode) - NATS
     left, right = _find_density_end(log_density, low, mode, least), _find_density_end(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
@@ -125,7 +125,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
 LogDensity = Callable[[jax.Array], jax.Array]
 
 
-def _find_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
+def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
     """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
     steps = np.linspace(0.0, 1.0, GRID)
 
@@ -175,7 +175,7 @@ def gain_quadrature(
     Raises:
         ValueError: another law; uncertain probabilities.
     """
-    check_density(law)
+    require_density(law)
     # Finitely many values: the law itself.
     if isinstance(law, Constant | Discrete):
         weights, values = np.array(law.list_atoms(), dtype=float).T

@@ -17,7 +17,7 @@ from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, fail, radii, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module, are_same, readable, unwritten
-from heliograph.numerics.traced import equal_to_rounding, is_traced, plain, stack_parts, within
+from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, plain, stack_parts, within
 from heliograph.numerics.types import ArrayLike, Float
 
 Scalar = Float[jax.Array | np.ndarray, ""]
@@ -83,10 +83,10 @@ class AbstractLaw(Module):
         Raises:
             ValueError: a law that cannot be sampled.
         """
-        return np.asarray(np.quantile(self._draw_values(), probability))
+        return np.asarray(np.quantile(self._draw_sample_of_gains(), probability))
 
     @in_float64
-    def _draw_values(self) -> np.ndarray:
+    def _draw_sample_of_gains(self) -> np.ndarray:
         """Draw DRAWS gains."""
         values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
         return values
@@ -161,7 +161,7 @@ class Discrete(AbstractLaw):
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
         """Return the lowest and highest E[g^order], also where the corners are too many to list."""
         powers = self.values**order
-        return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
+        return (-self.maximise_mean(-powers), self.maximise_mean(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
         """Decide whether another law has the same values, and its probabilities stay within the radius."""
@@ -173,7 +173,7 @@ class Discrete(AbstractLaw):
         """Return the values, with their probabilities."""
         return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
-    def worst(self, payoff: ArrayLike) -> float:
+    def maximise_mean(self, payoff: ArrayLike) -> float:
         """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
         Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the

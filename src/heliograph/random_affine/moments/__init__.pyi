@@ -1,14 +1,14 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .disturbed_gain import DisturbedGain as DisturbedGain
-from .disturbed_gain import disturb_hop as disturb_hop
-from .disturbed_gain import mix_gains as mix_gains
-from .disturbed_gain import noise_gain as noise_gain
-from .disturbed_gain import stack_on_shared_inputs as stack_on_shared_inputs
-from .intervals import CORNERS as CORNERS
-from .intervals import Interval as Interval
-from .intervals import multiply_interval_polynomials as multiply_interval_polynomials
-from .intervals import multiply_matrices as multiply_matrices
+from .gain_and_disturbance_moments import DisturbedGain as DisturbedGain
+from .gain_and_disturbance_moments import disturb_hop as disturb_hop
+from .gain_and_disturbance_moments import mix_gains as mix_gains
+from .gain_and_disturbance_moments import noise_gain as noise_gain
+from .gain_and_disturbance_moments import stack_on_shared_inputs as stack_on_shared_inputs
+from .interval_products import CORNERS as CORNERS
+from .interval_products import Interval as Interval
+from .interval_products import multiply_interval_polynomials as multiply_interval_polynomials
+from .interval_products import multiply_matrices as multiply_matrices
 from .mixture_components import AffineComponent as AffineComponent
 from .mixture_components import COMPONENT_LIMIT as COMPONENT_LIMIT
 from .mixture_components import GaussianBranches as GaussianBranches
@@ -17,7 +17,7 @@ from .mixture_components import NoiseWithoutOutliers as NoiseWithoutOutliers
 from .mixture_components import SignalNoise as SignalNoise
 from .mixture_components import combine_atoms as combine_atoms
 from .mixture_components import stack_branches as stack_branches
-from .moment_noise import about_mean as about_mean
+from .moment_tensors import symmetric_product as symmetric_product
 from .monomials import Exponents as Exponents
 from .monomials import JointMoments as JointMoments
 from .monomials import MEMORY_LIMIT_ENTRIES as MEMORY_LIMIT_ENTRIES
@@ -35,11 +35,12 @@ from .monomials import product_table as product_table
 from .monomials import refuse_if_too_large as refuse_if_too_large
 from .monomials import symmetric_power as symmetric_power
 from .monomials import times_one as times_one
+from .noise_from_moments import about_mean as about_mean
 from .pushed_moments import TabulatedNoise as TabulatedNoise
 from .pushed_moments import products_of_monomials as products_of_monomials
 from .pushed_moments import push_moments as push_moments
 from .pushed_moments import push_through_known_map as push_through_known_map
-from .quadratic_map import QuadraticMap as QuadraticMap
+from .second_moment_map import QuadraticMap as QuadraticMap
 from .second_moments import SecondOrder as SecondOrder
 from .second_moments import describe_second_moments as describe_second_moments
 from .second_moments import has_known_mean as has_known_mean
@@ -55,4 +56,3 @@ from .signal_path import Visit as Visit
 from .signal_path import apply as apply
 from .signal_path import carry_by_moments as carry_by_moments
 from .signal_path import refuse_gain_on_angles as refuse_gain_on_angles
-from .tensors import symmetric_product as symmetric_product

@@ -7,9 +7,9 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import jax
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import block_diagonal, library
+from heliograph.numerics.numpy_or_jax import block_diagonal, library
 from heliograph.numerics.types import Array, Float
 
 COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
@@ -36,7 +36,10 @@ class AffineComponent(NamedTuple):
 
     def above(self, other: "AffineComponent") -> "AffineComponent":
         """Stack on another map of the same input."""
-        gain, offset = _join_ends(self.gain, other.gain), _join_ends(self.offset, other.offset)
+        gain, offset = (
+            _concatenate_first_axis(self.gain, other.gain),
+            _concatenate_first_axis(self.offset, other.offset),
+        )
         return AffineComponent(self.weight * other.weight, gain, offset, block_diagonal([self.noise, other.noise]))
 
 
@@ -52,7 +55,7 @@ class NoiseAtom(NamedTuple):
 
     def above(self, other: "NoiseAtom") -> "NoiseAtom":
         """Stack on an independent noise."""
-        value = _join_ends(self.value, other.value)
+        value = _concatenate_first_axis(self.value, other.value)
         return NoiseAtom(self.weight * other.weight, value, block_diagonal([self.covariance, other.covariance]))
 
 
@@ -72,7 +75,7 @@ def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom
     return reduce(pairs, parts)
 
 
-def _join_ends(a: Array, b: Array) -> Array:
+def _concatenate_first_axis(a: Array, b: Array) -> Array:
     """Return b behind a, along the first axis."""
     joined: Array = library(a, b).concatenate([a, b])
     return joined

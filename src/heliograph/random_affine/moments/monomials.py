@@ -17,7 +17,7 @@ import numpy as np
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import scatter
+from heliograph.numerics.numpy_or_jax import scatter
 from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
@@ -94,7 +94,7 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
 
 
 @cache_arrays
-def _raise_table(variables: int, degree: int) -> np.ndarray:
+def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
     """Return at [i, c] the position at degree - 1 of monomial i over variable c; one past the end if it has no c."""
     lower = position(variables, degree - 1)
     table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
@@ -106,9 +106,9 @@ def _raise_table(variables: int, degree: int) -> np.ndarray:
 
 
 @cache_arrays
-def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
-    table = _raise_table(variables, degree)
+    table = _tabulate_quotient_positions(variables, degree)
     divisor = np.array(
         [max(c for c, power in enumerate(powers) if power) for powers in list_exponents(variables, degree)]
     )
@@ -127,8 +127,8 @@ def symmetric_power(h: Numbers, degree: int) -> Numbers:
     refuse_if_too_large(count_monomials(outputs, degree), count_monomials(inputs, degree), f"moments of order {degree}")
     power = h
     for k in range(2, degree + 1):
-        divisor, parent = _last_factor(outputs, k)
-        table = _raise_table(inputs, k)
+        divisor, parent = _find_dividing_variable(outputs, k)
+        table = _tabulate_quotient_positions(inputs, k)
         padded = _append_zero_column(power)[parent]
         power = sum(h[divisor, c][:, None] * padded[:, table[:, c]] for c in range(inputs))
     return power

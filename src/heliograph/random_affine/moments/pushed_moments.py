@@ -13,11 +13,10 @@ import numpy as np
 
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import is_traced, plain, stack_parts
+from heliograph.numerics.numpy_or_jax import is_traced, plain, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Series
-from heliograph.random_affine.hop import GainAndNoise, affine_matrix, gain_moments
+from heliograph.random_affine.hop import GainAndNoise, affine_matrix, tabulate_gain_moments
 from heliograph.random_affine.mixture import Mixture
 from heliograph.random_affine.moments.monomials import (
     Exponents,
@@ -29,7 +28,8 @@ from heliograph.random_affine.moments.monomials import (
     product_table,
     symmetric_power,
 )
-from heliograph.random_affine.noise import AbstractNoise, Number, noise_vector
+from heliograph.random_affine.noise import AbstractNoise, Number, noise_moment_vector
+from heliograph.random_affine.series_and_stack import Series
 
 Array1 = Float[jax.Array | np.ndarray, " n"]
 Array2 = Float[jax.Array | np.ndarray, "n m"]
@@ -43,7 +43,7 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
     """
-    return channel.moments(order).expect(_check_moments(channel, order, moments))
+    return channel.moments(order).expect(_read_moments(channel, order, moments))
 
 
 @push_moments.register
@@ -52,10 +52,10 @@ def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Arr
 
     E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
     """
-    known = push_through_known_map(affine_matrix(channel.matrix), order, _check_moments(channel, order, moments))
-    scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
+    known = push_through_known_map(affine_matrix(channel.matrix), order, _read_moments(channel, order, moments))
+    scaled = known * tabulate_gain_moments(channel.law, order)[degrees(channel.outputs, order)]
     row, column, noise, weight = plan_binomial_sums(channel.outputs, order)
-    terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
+    terms = weight * noise_moment_vector(channel.noise, order)[noise] * scaled[column]
     if is_traced(terms):
         return jnp.bincount(row, terms, length=len(scaled))
     return np.bincount(row, np.asarray(terms), minlength=len(scaled))
@@ -86,7 +86,7 @@ def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> 
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     second = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
-    propagated = second.reshape(-1)[_choose_places(outputs, order // 2)]
+    propagated = second.reshape(-1)[_choose_product_places(outputs, order // 2)]
     return propagated
 
 
@@ -101,7 +101,7 @@ class TabulatedNoise(AbstractNoise):
 
     def __init__(self, source: AbstractNoise, order: int):
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
-        self.table, self.order = noise_vector(source, order), order
+        self.table, self.order = noise_moment_vector(source, order), order
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw from the law itself."""
@@ -112,8 +112,8 @@ class TabulatedNoise(AbstractNoise):
         return plain(self.table[position(len(powers) + 1, self.order)[(*powers, self.order - sum(powers))]])
 
 
-@noise_vector.register
-def _look_moments_up(noise: TabulatedNoise, order: int) -> Array1:
+@noise_moment_vector.register
+def _read_tabulated_moments(noise: TabulatedNoise, order: int) -> Array1:
     """Return all moments up to `order` of a noise, out of its table."""
     return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
@@ -133,7 +133,7 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
     return moments[product_table(variables, degree, degree)]
 
 
-def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     """Return the moments; raise unless they are those of the channel's inputs up to the order."""
     check_forgets("channel of a lift", channel)
     expected = count_monomials(channel.inputs + 1, order)
@@ -143,7 +143,7 @@ def _check_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -
 
 
 @cache_arrays
-def _choose_places(variables: int, degree: int) -> np.ndarray:
+def _choose_product_places(variables: int, degree: int) -> np.ndarray:
     """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
     table = product_table(variables, degree, degree).reshape(-1)
     places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)

@@ -7,16 +7,21 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, columns_of
+from heliograph.factors.covariance_factors import WeightedColumns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
-from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.moments.intervals import CORNERS
+from heliograph.random_affine.moments.interval_products import CORNERS
+from heliograph.random_affine.moments.moment_tensors import (
+    Matrix,
+    Tensor,
+    drop_constant,
+    symmetric_product,
+)
 from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, JointMoments
-from heliograph.random_affine.moments.quadratic_map import (
+from heliograph.random_affine.moments.second_moment_map import (
     QuadraticMap,
     add_maps,
     map_of_known_law,
@@ -25,19 +30,14 @@ from heliograph.random_affine.moments.quadratic_map import (
     signal_of_map,
     size_of_map,
 )
-from heliograph.random_affine.moments.tensors import (
-    Matrix,
-    Tensor,
-    drop_constant,
-    symmetric_product,
-)
-from heliograph.random_affine.moments.uncertain_law import (
+from heliograph.random_affine.moments.uncertain_law_bounds import (
     PROPORTIONAL_TOLERANCE,
     bound_all_laws,
     bound_from_intervals,
     tensors_of_law,
 )
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.series_and_stack import Stack
+from heliograph.random_affine.sum_of_maps import Superposed
 
 
 class SecondOrder(Module):
@@ -287,9 +287,9 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_spreads(spreads)
     # Spreads of a sum add up, and that of its noise.
-    whole, size = channel.in_places(dict(enumerate(means)), 1), channel.inputs + 1
-    noise = channel.noise.covariance[..., None, None] * _constant_power(size)
-    spread: Tensor = channel.in_places(dict(enumerate(spreads)), 2) + noise
+    whole, size = channel.sum_in_places(dict(enumerate(means)), 1), channel.inputs + 1
+    noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
+    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), 2) + noise
     return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
@@ -330,9 +330,9 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     """
     # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
     every = range(len(parts))  # numbers of the parts
-    mean = channel.in_places({i: parts[i].mean for i in every}, 1)
+    mean = channel.sum_in_places({i: parts[i].mean for i in every}, 1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _constant_power(channel.inputs + 1))
+    noise = map_of_known_law(channel.noise.covariance[..., None, None] * _make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
     spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
     # Known means: nothing is shifted.
@@ -365,10 +365,10 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
     """Return the weighted sum of the maps of parts, each at the places of what its part takes."""
     parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
-    center = channel.in_places({i: part.center for i, part in parts.items()}, 2)
-    return QuadraticMap(center, channel.in_places({i: part.radius for i, part in parts.items()}, 2))
+    center = channel.sum_in_places({i: part.center for i, part in parts.items()}, 2)
+    return QuadraticMap(center, channel.sum_in_places({i: part.radius for i, part in parts.items()}, 2))
 
 
-def _constant_power(size: int) -> np.ndarray:
+def _make_power_of_constant(size: int) -> np.ndarray:
     """Return the matrix W = Y Y' of zeros, but 1 as its last entry: that of the constant 1 alone."""
     return np.outer(np.eye(size)[-1], np.eye(size)[-1])

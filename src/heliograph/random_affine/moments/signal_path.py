@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.moments.monomials import JointMoments
 
@@ -34,12 +34,12 @@ class ChannelPosition(NamedTuple):
     hops: int
     signal: SignalMoment | None
 
-    def number(self, maps: Sequence[T], word: str) -> "list[tuple[T, ChannelPosition]]":
+    def number_maps(self, maps: Sequence[T], word: str) -> "list[tuple[T, ChannelPosition]]":
         """Return maps side by side, each with its position: names begin with the word and the map's number."""
         at = [self._replace(prefix=f"{self.prefix}{word}{i}.", hops=0) for i in range(1, len(maps) + 1)]
         return list(zip(maps, at, strict=True))
 
-    def select(self, places: Sequence[int]) -> "ChannelPosition":
+    def select_components(self, places: Sequence[int]) -> "ChannelPosition":
         """Return the position at a map that takes the components at these places."""
         if self.signal is None:
             return self

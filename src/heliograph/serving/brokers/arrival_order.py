@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_unset_stamps
+from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_unset_stamps
 from heliograph.serving.message import Message, NumberedMessage, Payload, UnreadMessage
 
 HELD = 250_000  # messages that wait for earlier ones

@@ -11,7 +11,7 @@ from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.model.checks.refusals import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value
-from heliograph.numerics.times.row_order import YEAR
+from heliograph.numerics.times.timestamp_order import YEAR
 from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import LONGEST, Message, UnreadMessage
 from heliograph.simulation.network import Network

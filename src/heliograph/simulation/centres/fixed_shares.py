@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.mesh.joint_error_covariance import scatter_blocks
 from heliograph.linear.jump_system import propagate_by_mode

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
 from heliograph.filters.linear.belief import LinearBelief

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.factors.roots import covariance_of_root, observe_information, roots_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_information, roots_of
 from heliograph.fusion.mesh.joint_error_covariance import (
     blocks_of,
     error_transitions,

@@ -17,10 +17,10 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.numerics.check import array, fail, instance, spread_over_names
 from heliograph.numerics.module import Module
-from heliograph.numerics.traced import library, plain
+from heliograph.numerics.numpy_or_jax import library, plain
 from heliograph.numerics.types import ArrayLike, Bool, Int, PyTree, Scalar
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps
-from heliograph.random_affine.delay import Delayed, signal_size
+from heliograph.random_affine.delay import DelayedLink, signal_size
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
@@ -207,7 +207,7 @@ def check_edge(what: str, link: Channel) -> None:
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
-        _, inside = _open_link(step, Erasure | Delayed)
+        _, inside = _open_link(step, Erasure | DelayedLink)
         for mode_link in inside.maps if isinstance(inside, Modes) else [inside]:
             _, mode = _open_link(mode_link)
             if mode.remembers or mode.past or not _is_perfect(mode):
@@ -215,10 +215,10 @@ def check_edge(what: str, link: Channel) -> None:
                 raise fail(what, expected, type(first(link)).__name__)
 
 
-def find_delay(channel: AbstractRandomAffine) -> Delayed | None:
+def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
     """Return the delay inside a link, whose messages may also be lost; None of a link without delay."""
     _, inside = _open_link(channel)
-    return inside if isinstance(inside, Delayed) else None
+    return inside if isinstance(inside, DelayedLink) else None
 
 
 def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
@@ -246,7 +246,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None
-    arrival, inside = _open_link(channel, Erasure | Delayed)
+    arrival, inside = _open_link(channel, Erasure | DelayedLink)
     if not isinstance(inside, Modes):
         return None if inside.erases else 1 - float(arrival)
     chances = [find_arrival_probability(mode) for mode in inside.maps]

@@ -58,7 +58,7 @@ def _linearise_observation(
     signal = c @ mean + sensor.noise.mean  # E y, y = C x + v
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
-    spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
+    spread = channel.nominal.evaluate_center(second, jnp.ones(len(gain), dtype=bool))
     return JointObservation(
         gain=gain @ c, offset=gain @ sensor.noise.mean + channel.offset, noise=gain @ noise @ gain.T + spread
     )

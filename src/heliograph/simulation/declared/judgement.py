@@ -16,7 +16,7 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
-from heliograph.random_affine.reported_law import AbstractTold
+from heliograph.random_affine.channel_state_information import AbstractToldMap
 from heliograph.simulation.declared.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared.refit import (
     DeclaredRows,
@@ -233,7 +233,7 @@ def _judge_link(
 class _DeclaredNoises(eqx.Module):
     """The variances of a told link's noises as a function of the numbers that it is told."""
 
-    told: AbstractTold
+    told: AbstractToldMap
 
     def __call__(self, numbers: Array) -> Array:
         """Return the variances of these numbers' noises, one after another."""

@@ -21,8 +21,14 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.channel_state_information import (
+    AbstractToldMap,
+    ToldGainHop,
+    ToldMap,
+    list_told_maps,
+    list_told_numbers_of_outputs,
+)
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.reported_law import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.runs.over_runs import over_runs
 
@@ -42,7 +48,8 @@ class DeclaredRows(NamedTuple):
 
     Args:
         filter: the filter.
-        link: which of the links that tell numbers (`told_maps`): its noise is judged, that of others is as declared.
+        link: which of the links that tell numbers (`list_told_maps`): its noise is judged, that of others is as
+            declared.
         edges: logarithms of declared variances at which one class of messages ends and the next begins (classes - 1,).
         deviation: usual declared deviation of each output of the link (outputs,).
         z: measurements (steps, received).
@@ -77,7 +84,7 @@ class LinkPlace(NamedTuple):
         outputs: outputs of the sensor that the link carries; None where values are not outputs one by one.
     """
 
-    told: AbstractTold
+    told: AbstractToldMap
     numbers: list[int]
     values: list[int]
     outputs: list[int] | None
@@ -88,13 +95,13 @@ def find_place(filter: ToldFilter, link: int) -> LinkPlace:
 
     Args:
         filter: the filter of all.
-        link: its number among `told_maps`.
+        link: its number among `list_told_maps`.
     """
     # Columns of its numbers among all that are told, and rows of the values on which they have an effect.
-    maps, sensor = told_maps(first(filter.link)), first(filter.sensor)
+    maps, sensor = list_told_maps(first(filter.link)), first(filter.sensor)
     before = sum(affine.memory.announced for affine in maps[:link])
     columns = list(range(before, before + maps[link].memory.announced))
-    of_link = np.flatnonzero(numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
+    of_link = np.flatnonzero(list_told_numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
     whole = len(of_link) == len(filter.values)  # all that is received comes over this link
     outputs = list(range(len(sensor.outputs))) if whole else of_link
     return LinkPlace(
@@ -140,7 +147,7 @@ def list_noise_variances(link: AbstractRandomAffine) -> jax.Array:
 
 def list_declaring(filter: ToldFilter) -> list[int]:
     """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
-    maps = told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
+    maps = list_told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
     return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
 
 

@@ -10,9 +10,9 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
-from heliograph.numerics.traced import describe_rounded, is_traced
+from heliograph.numerics.numpy_or_jax import describe_rounded, is_traced
 from heliograph.random_affine.composite import ARROW, DIRECT
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.simulation.claims import list_other_beliefs
 from heliograph.simulation.description.single_precision_numbers import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node

@@ -17,11 +17,11 @@ from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
 from heliograph.model.reported_numbers import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
-from heliograph.numerics.traced import DOUBLE
+from heliograph.numerics.numpy_or_jax import DOUBLE
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.modes import redraw_modes_each_step
-from heliograph.random_affine.reported_law import told_maps
-from heliograph.random_affine.superposed import Superposed
+from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
 from heliograph.simulation.claims import OtherBelief, list_other_beliefs
 from heliograph.simulation.declared.refit import list_declaring
@@ -195,8 +195,8 @@ def _find_reservations(network: Network) -> Iterator[Doubt]:
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
             continue
-        for affine in told_maps(first(node.channel)):
-            if why := affine.reservation:
+        for affine in list_told_maps(first(node.channel)):
+            if why := affine.reason_for_no_claim:
                 what = join_names([repr(number) for number in affine.names])
                 yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
 

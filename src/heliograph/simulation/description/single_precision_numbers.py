@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.model.over_time import first
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import InputError
-from heliograph.numerics.traced import constants, find_rounded_to_single, is_traced
+from heliograph.numerics.numpy_or_jax import constants, find_rounded_to_single, is_traced
 from heliograph.simulation.node import HasNodes, Node
 
 Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]

@@ -13,7 +13,7 @@ from heliograph.filters.filter_data import check_data
 from heliograph.filters.innovation import HALF
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
-from heliograph.numerics.counted_shares import average_correlated
+from heliograph.numerics.confidence_intervals import average_correlated
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import whiten
 from heliograph.numerics.module import readable

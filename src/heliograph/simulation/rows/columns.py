@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.model.estimate import Claim
 from heliograph.numerics.module import readable
-from heliograph.numerics.trees.flat import FlatLayout
+from heliograph.numerics.trees.flattened_trees import FlatLayout
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.results.by_name import collect_modes, split_by_name

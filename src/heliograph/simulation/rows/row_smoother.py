@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import choose_code, map_arrays, read_setting
+from heliograph.engine.choice import choose_code, map_arrays, read_forced_engine
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.fusion.network_fusion import Fusion
@@ -21,7 +21,7 @@ from heliograph.model.estimate import Claim, Estimate, lower_unsound_claim
 from heliograph.numerics.check import InputError, fail, instance, is_whole, show_value
 from heliograph.numerics.float64 import to_numpy, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import Network
@@ -122,7 +122,7 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
         """Smooth rows `begin` to `stop` from the last one back; return the estimates after the first."""
-        sweep: BackwardSweep = static.filled(numbers)
+        sweep: BackwardSweep = static.with_arrays(numbers)
         begin, stop = span
         last_row = stop - 1, history.step[stop - 1]
         # How many steps lead from the last row back to row `begin`.
@@ -241,14 +241,14 @@ class RowSmoother:
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
         """Return the program for histories of this length, which an engine is chosen for once."""
-        key = len(history.rows), read_setting()
+        key = len(history.rows), read_forced_engine()
         if key not in self._programs:
             span = np.zeros(2, dtype=np.int32)
             choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
             if choice.code is None:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:
-                code = choice.code.with_first(*self._numbers)
+                code = choice.code.with_first_arguments(*self._numbers)
                 self._programs[key] = lambda *arguments: _take_only_run(code(*jax.tree.leaves(arguments)))
         return self._programs[key]
 

@@ -13,9 +13,9 @@ from heliograph.filters.remark import Remark
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64, in_haste, understood
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.trees.flat import FlatLayout, flatten_to_row, make_flat_layout
+from heliograph.numerics.trees.flattened_trees import FlatLayout, flatten_to_row, make_flat_layout
 from heliograph.numerics.trees.program_text import write_program_text
-from heliograph.numerics.trees.static import Static, split_structure
+from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.description.remarks import find_remarking, list_remarks
 from heliograph.simulation.network import Network
@@ -133,12 +133,12 @@ class RowStep:
         row = np.zeros((1, self._layout.size))
         self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), (False, True))
         code = self._choice.code
-        self._code = None if code is None else code.with_first(*self._numbers)
+        self._code = None if code is None else code.with_first_arguments(*self._numbers)
 
     @property
     def engine(self) -> str:
         """Return which engine steps the filters, and why."""
-        return self._choice.explained
+        return self._choice.explanation
 
     @property
     def is_native(self) -> bool:
@@ -195,7 +195,7 @@ class RowStep:
 
     def for_one(self) -> "OneRowStep":
         """Return the step of one row at a time, which has memory of its own."""
-        return OneRowStep(self, None if self._code is None else self._code.for_runs(1))
+        return OneRowStep(self, None if self._code is None else self._code.make_in_place_code(1))
 
     def __call__(self, rows: Float[np.ndarray, "row column"], alone: bool = False) -> Float[np.ndarray, "row column"]:
         """Return the states and outputs after each row's step.
@@ -261,7 +261,7 @@ def _make_step(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.split_row(row))
+        stepped: tuple[PyTree, PyTree] = layout.static.with_arrays(numbers).step(*layout.split_row(row))
         return stepped
 
     return jax.jit(step, inline=True)

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.results.statistics import BATCHES

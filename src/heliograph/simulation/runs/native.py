@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.choice import try_native
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.choice import make_native_or_none
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.arguments import Precision
@@ -72,7 +72,7 @@ def compile_runs(
         # The refusal is cached; it is raised afresh, so that the cached one holds no traceback.
         raise Unsupported(compiled.operation, compiled.where)
     program, result_tree = compiled
-    return NativeProgram(program.begin([key_words, *arrays, *others], runs), result_tree)
+    return NativeProgram(program.bind_arguments([key_words, *arrays, *others], runs), result_tree)
 
 
 def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: int, precision: Precision) -> None:
@@ -314,7 +314,9 @@ def simulate_natively(
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
     if can_be_split and type(reducer).joined is not AbstractReducer.joined:
         return _simulate_in_parts(network, inputs, key, reducer, (first_run, runs, chunk), progress, precision)
-    code = try_native(lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision))
+    code = make_native_or_none(
+        lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision)
+    )
     if code is None:
         return None
     check_memory_of_parts(code, 1, runs, len(inputs), precision)
@@ -354,7 +356,7 @@ def _simulate_in_parts(
     running: tuple[NativeRuns, Network] | None = None
     for some, world in split_nodes(network):
         make = partial(compile_runs, world, inputs, key, reducer, runs, precision=precision)
-        code = try_native(make)
+        code = make_native_or_none(make)
         if code is None:
             return None
         if running is None:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from heliograph.engine.choice import get_thread_pool
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.runs.lanes import (
     LANES,
@@ -79,7 +79,7 @@ class NativeRuns:
         def simulate_lane(lane: int) -> list[np.ndarray | None]:
             """Add a lane's runs to its sums; return what is collected of them."""
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.make_zero_sums(self.memory)
-            collected: list[np.ndarray | None] = self.code.begun.add(runs_of_lane[lane], sums)
+            collected: list[np.ndarray | None] = self.code.begun.add_runs(runs_of_lane[lane], sums)
             return collected
 
         return _RunningChunk(
@@ -109,7 +109,7 @@ class NativeRuns:
         """Return the sums over all runs, by batch, and give their memory back; nothing that is collected."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
-        totals = iter(code.add_parts(used))
+        totals = iter(code.add_partial_sums(used))
         self.memory += used
         leaves, common = [], []
         # Results that all runs share stand as of one run.

@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code, get_thread_pool
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import fully_optimised, to_numpy
-from heliograph.numerics.masked import fill_masked
+from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.types import PyTree
 
 WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them stay in the cache

@@ -10,7 +10,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
 from heliograph.model.words.word_channel import reader_of, rewrite_in_bits
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import drop_names, memories
+from heliograph.random_affine.memories_of_channels import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import checksum

@@ -26,7 +26,7 @@ from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import condition_on_memories
+from heliograph.random_affine.memories_of_channels import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.side_by_side import map_all
 from heliograph.simulation.transmission.shared_fading import deliver_signal, move_modes, start, start_modes

@@ -11,7 +11,7 @@ from heliograph.numerics.check import array, check_count, check_horizon, check_s
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.delay import Delayed
+from heliograph.random_affine.delay import DelayedLink
 from heliograph.random_affine.moments.signal_path import apply
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -116,8 +116,8 @@ def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray
     link = first(channel)
     if link is None or not link.past:
         return z, np.zeros(len(z))
-    if isinstance(link, Delayed) and link.timestamped:
+    if isinstance(link, DelayedLink) and link.timestamped:
         return z[:, :-1], z[:, -1]
-    if isinstance(link, Delayed) and link.constant:
+    if isinstance(link, DelayedLink) and link.constant:
         return z, np.full(len(z), float(link.past))
     raise fail(f"delays of node {name!r}", "constant ones, or time stamps", "random ones without time stamps")

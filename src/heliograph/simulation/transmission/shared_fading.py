@@ -18,9 +18,14 @@ from heliograph.model.over_time import at, stack, structure_key
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.chain import AbstractMemory, unique_memories
 from heliograph.random_affine.delay import signal_size
-from heliograph.random_affine.memory import draw_with_shared_memories, drop_names, init_with_shared_memories, memories
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, unique_memories
+from heliograph.random_affine.memories_of_channels import (
+    draw_with_shared_memories,
+    drop_names,
+    init_with_shared_memories,
+    memories,
+)
 from heliograph.random_affine.moments.signal_path import apply
 from heliograph.simulation.random_keys import (
     CHANNEL,

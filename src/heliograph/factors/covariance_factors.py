@@ -1,0 +1,388 @@
+"""Covariances as sums of squares W diag(w) W', and the two ways to their factors L diag(d) L'.
+
+L is unit lower triangular and d is never negative, so that a variance is a sum of positive terms in any precision. Rows
+are made orthogonal (`triangularise`) where digits matter: a row is known to eps, so its square to eps^2. The sum is
+formed and eliminated (`eliminate`) where products matter: two thirds of them, and a pivot is known to eps of its
+variance.
+
+A known zero of a matrix stays a known zero through a matrix product, not through a product of numbers, which might be
+NaN: so products of rows and columns are written as matrix products here.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from heliograph.numerics.caching import cache_arrays
+from heliograph.numerics.linalg import WRITTEN, diagonal, outer, scale, symmetric
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.trace_settings import precision_in_use
+from heliograph.numerics.types import Array
+from straightline import operation
+
+ROUNDING_UNITS = 4  # how many eps of a number are noise of it
+LARGEST = 1e30  # variance by rounding: beyond it numbers are absurd, and their squares none in single precision
+RANK = 1e-12  # of a component's variance: less of a pivot of a known covariance is none
+
+
+class WeightedColumns(NamedTuple):
+    """A covariance W diag(w) W'.  Shapes: matrix W (n, columns), weights w (columns,)."""
+
+    matrix: Any  # Float[Array, "n columns"], NumPy's or JAX's
+    weights: Any
+
+    @property
+    def covariance(self) -> jax.Array:
+        """W diag(w) W' (n, n)."""
+        matrix = jnp.asarray(self.matrix)
+        return symmetric((matrix * self.weights) @ matrix.T)
+
+    @property
+    def diagonal(self) -> jax.Array:
+        """Diagonal of the covariance: variances (n,)."""
+        variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
+        return variances
+
+    def through(self, matrix: Array) -> "WeightedColumns":
+        """Return the covariance of A v for a v with this one."""
+        return WeightedColumns(matrix @ self.matrix, self.weights)
+
+    def times(self, factor: Array) -> "WeightedColumns":
+        """Return the covariance times a number."""
+        return WeightedColumns(self.matrix, self.weights * factor)
+
+
+def join_columns(*parts: WeightedColumns) -> WeightedColumns:
+    """Add covariances: their columns side by side."""
+    matrix = jnp.concatenate([jnp.asarray(part.matrix) for part in parts], axis=1)
+    return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(part.weights) for part in parts]))
+
+
+def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
+    """Add covariances P_i with weights, sum_i w_i P_i; `parts` have a leading axis."""
+    matrix = jnp.asarray(parts.matrix)
+    columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
+    return WeightedColumns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
+
+
+def zero_covariance(n: int) -> WeightedColumns:
+    """Return the covariance of zero of n components: no columns."""
+    return WeightedColumns(np.zeros((n, 0)), np.zeros(0))
+
+
+def unit_lower(entries: Array) -> Any:
+    """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
+    xp, place = library(entries), _place_unit_lower(entries.shape[-1])
+    ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
+    whole = xp.concatenate([entries, ends], axis=-1)
+    return whole[..., place] if xp is np else _take_entries(whole, place)
+
+
+@cache_arrays
+def _place_unit_lower(count: int) -> np.ndarray:
+    """Return for each number of L which of its entries it is; `count` stands for a zero, and the next for a one."""
+    n = (1 + int(np.sqrt(1 + 8 * count))) // 2
+    place = np.full((n, n), count)
+    place[np.tril_indices(n, -1)] = np.arange(count)
+    np.fill_diagonal(place, count + 1)
+    return place
+
+
+def below_diagonal(lower: jax.Array) -> jax.Array:
+    """Read off the entries of L below its diagonal, row by row: the inverse of `unit_lower`."""
+    n = lower.shape[-1]
+    return _take_entries(lax.reshape(lower, (n * n,)), np.flatnonzero(np.tri(n, k=-1)))
+
+
+def _take_entries(entries: jax.Array, places: np.ndarray) -> jax.Array:
+    """Take entries of the last axis at places that are known."""
+    axis = entries.ndim - 1
+    numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
+    sizes = (*entries.shape[:-1], 1)
+    return lax.gather(entries, places[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
+
+
+def is_positive(x: jax.Array) -> jax.Array:
+    """Return whether x is a positive normal number: of smaller ones 1 / x may be infinite, so that they count as 0."""
+    return x > float(np.finfo(np.dtype(x.dtype)).tiny)
+
+
+@jax.jit
+def reciprocal_or_one(x: jax.Array) -> jax.Array:
+    """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
+    return 1 / jnp.where(is_positive(x), x, 1.0)
+
+
+@jax.jit
+def reciprocal_or_zero(x: jax.Array) -> jax.Array:
+    """Return 1 / x of a positive number, and 0 of 0."""
+    positive = is_positive(x)
+    return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
+
+
+@jax.jit
+def square_root(x: jax.Array) -> jax.Array:
+    """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def triangularise(columns: WeightedColumns) -> WeightedColumns:
+    """Find L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
+
+    d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
+    columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below.
+
+    Source: Thornton, Triangular covariance factorizations for Kalman filtering (1976), modified weighted Gram-Schmidt.
+    """
+    if len(columns.matrix) > WRITTEN:
+        return _triangularise_by_loop(columns)
+    return _triangularise_row_by_row(columns)
+
+
+def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
+    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another."""
+    rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
+    n, lower, variances = len(rows), [], []
+    for j in range(n):
+        row = lax.index_in_dim(rows, j, keepdims=False)
+        weighted = scale(weights, row)
+        variances.append(lax.dot(row, weighted))
+        share = column_below_diagonal(
+            j, outer(lax.dot(rows, weighted), lax.reshape(reciprocal_or_one(variances[j]), (1,)))
+        )
+        rows = rows - outer(share, row)
+        lower.append(share)
+    return assemble_factors(lower, variances, rows.dtype)
+
+
+def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -> WeightedColumns:
+    """Return the factors (unit lower triangular M, e) with M diag(e) M' = L diag(d) L' + W diag(w) W'.
+
+    `factors` are L (n, n), unit lower triangular, and d (n,); `columns` W (n, count) and w (count,), absorbed one after
+    another in a loop, a shorter program than `triangularise`. A column c of weight w goes from row to row j: with
+    d_j' = d_j + w c_j^2, s = d_j / d_j' and g = w c_j / d_j', column j of L becomes s L_j + g c, c loses c_j L_j, and w
+    becomes s w. These rotations without roots keep each row to eps of itself.
+
+    Source: Gentleman, Least squares computations by Givens transformations without square roots (1973).
+    """
+    n, dtype = len(factors.matrix), jnp.asarray(columns.matrix).dtype
+    rows, places = np.tril_indices(n, -1)
+    # Place of entry (i, j) of L in the flat array of what is below its diagonal.
+    flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
+
+    def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+        """Rotate one column (c, w) into the factors (entries below the diagonal, d), from the first row down."""
+        (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
+        for j in range(n):
+            d = variances[j] + weight * c[j] ** 2
+            reciprocal = reciprocal_or_one(d)
+            s, g = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0), weight * c[j] * reciprocal
+            variances[j] = d
+            for i in range(j + 1, n):
+                e = flat_place[i, j]
+                lower[e], c[i] = s * lower[e] + g * c[i], c[i] - c[j] * lower[e]
+            weight = weight * s
+        return (jnp.asarray(lower, dtype), jnp.asarray(variances, dtype)), None
+
+    start = below_diagonal(jnp.asarray(factors.matrix)).astype(dtype), jnp.asarray(factors.weights).astype(dtype)
+    (lower, variances), _ = lax.scan(absorb, start, (jnp.asarray(columns.matrix).T, jnp.asarray(columns.weights)))
+    return WeightedColumns(unit_lower(lower), variances)
+
+
+def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
+    """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
+
+    A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
+    of zero: it is at least `least` times the variance's size.
+    """
+    pivots = least * jnp.abs(diagonal(covariance))
+    return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
+
+
+def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
+    """Return L and d with L diag(d) L' = P, by elimination without square roots; no d is below `least`."""
+    n, rest, lower, variances = len(covariance), covariance, [], []
+    for j in range(n):
+        column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
+        variances.append(_bound_below(column[j], least[j]))
+        share = column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
+        rest = symmetric(rest - outer(share, column))
+        lower.append(share)
+    return assemble_factors(lower, variances, covariance.dtype)
+
+
+def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
+    """Return L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows of uncorrelated noises."""
+    solved: list[jax.Array] = []
+    for i in range(len(rows)):
+        known = jnp.stack(solved) if solved else jnp.zeros((0, rows.shape[1]))
+        solved.append(rows[i] - lower[i, :i] @ known)
+    return jnp.stack(solved) if solved else rows
+
+
+def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
+    """Return W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of the deviations.
+
+    Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
+    """
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(deviation > 0, deviation, 1.0)
+    rest, columns = covariance / np.outer(scale, scale), []
+    for _ in range(len(covariance)):
+        j = int(np.argmax(np.diagonal(rest)))
+        if rest[j, j] <= RANK:
+            break
+        columns.append(rest[:, j] / np.sqrt(rest[j, j]))
+        rest = rest - np.outer(columns[-1], columns[-1])
+        rest[j] = rest[:, j] = 0.0
+    root = np.array(columns).T.reshape(len(covariance), -1)
+    return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
+
+
+def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Factor a known covariance: entries of L below its diagonal, and d, by the orthogonal rows of its root."""
+    rows = find_covariance_root(covariance)
+    n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
+    for j in range(n):
+        variances[j] = rows[j] @ rows[j]
+        lower[j + 1 :, j] = rows[j + 1 :] @ rows[j] / (variances[j] or 1.0)
+        rows[j + 1 :] -= np.outer(lower[j + 1 :, j], rows[j])
+    return lower[np.tril_indices(n, -1)], variances
+
+
+def columns_of(covariance: Array) -> WeightedColumns:
+    """Return the columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
+    if isinstance(covariance, np.ndarray):
+        root = find_covariance_root(covariance)
+        return WeightedColumns(root, np.ones(root.shape[1]))
+    return eliminate(jnp.asarray(covariance))
+
+
+def factor_covariances(covariances: Array) -> WeightedColumns:
+    """Return the columns (count, n, n) of covariances (count, n, n), one after another.
+
+    Of covariances that are known they are roots, padded by columns of zeros; of others they come by elimination.
+    """
+    if not isinstance(covariances, np.ndarray):
+        eliminated: WeightedColumns = jax.vmap(eliminate)(covariances)
+        return eliminated
+    n = covariances.shape[-1]
+    each = list(covariances.reshape(-1, n, n))
+    # Most steps of a long horizon have the same covariance, which is factored once.
+    different = {covariance.tobytes(): covariance for covariance in each}
+    roots = {numbers: find_covariance_root(covariance) for numbers, covariance in different.items()}
+    padded = {numbers: np.pad(root, ((0, 0), (0, n - root.shape[1]))) for numbers, root in roots.items()}
+    matrices = [padded[covariance.tobytes()] for covariance in each]
+    return WeightedColumns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
+
+
+def rounding_of(second_moments: Array) -> WeightedColumns:
+    """Return the covariance (n, n) of the rounding of numbers s_i: diagonal, (ROUNDING_UNITS eps)^2 E[s_i^2].
+
+    It is put where a model is made: of the state beside Q, of a measurement beside R; as columns, since added to a
+    variance it would be lost.
+
+    Args:
+        second_moments: E[s_i^2] (n,); of very large ones the variance is LARGEST, so that it stays finite.
+    """
+    variances = (ROUNDING_UNITS * unit_of(second_moments)) ** 2 * second_moments
+    return WeightedColumns(np.eye(len(second_moments)), library(second_moments).minimum(variances, LARGEST))
+
+
+def rounding_of_pivots(covariance: Array) -> float:
+    """Return the share of its variance to which elimination of n columns knows a pivot: n eps, one for each column."""
+    return len(covariance) * unit_of(covariance)
+
+
+def rounding_of_variances(variances: Array, products: int) -> Array:
+    """Return by how much variances that are sums of so many products may be off: ROUNDING_UNITS products eps of each.
+
+    For what is left of a variance from which a known part was subtracted: it is known to no less than this.
+    """
+    return ROUNDING_UNITS * products * unit_of(variances) * variances
+
+
+def noise_beside_repeated(sizes: Array) -> Array:
+    """Return variances eps s^2 of a noise beside which a number of size s that others determine says nothing.
+
+    Of what others determine slopes of an eps s are left. Squared they are eps times this noise, and so is the gain.
+    """
+    return unit_of(sizes) * sizes**2
+
+
+def unit_of(numbers: Array) -> float:
+    """Return eps of the precision in which these numbers are computed."""
+    return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(precision_in_use()).eps))
+
+
+def _bound_below(pivot: jax.Array, floor: jax.Array) -> jax.Array:
+    """Return the larger of both; not by a maximum, which halves the derivative where both are zero."""
+    return jnp.where(pivot >= floor, pivot, floor)
+
+
+def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
+    """Return column j of L without its diagonal: the entries below it, zeros above."""
+    n = len(column)
+    return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
+
+
+def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
+    """Put L and d together from the columns below the diagonal and the entries of d."""
+    n = len(variances)
+    if not n:
+        return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
+    below = lax.concatenate([lax.expand_dims(column, (1,)) for column in lower], 1)
+    return WeightedColumns(
+        below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0)
+    )
+
+
+@operation(_triangularise_row_by_row)
+def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
+    """Compute `triangularise` as a loop over the rows; natively row by row where known zeros leave little to compute.
+
+    The noises of sixty links are their own columns each: of 12,000 numbers of W all but two hundred are known zeros.
+    """
+    rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
+    n = len(rows)
+
+    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take row j off the rows below it, and put its column of L and its entry of d in their places."""
+        rows, lower, variances = carry
+        weighted = weights * rows[j]
+        d = rows[j] @ weighted
+        share = jnp.where(np.arange(n) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        return rows - jnp.outer(share, rows[j]), *insert_column(j, lower, share, variances, d)
+
+    start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
+    _, lower, variances = lax.fori_loop(0, n, body, start)
+    return WeightedColumns(lower, variances)
+
+
+@operation(_eliminate_column_by_column)
+def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
+    """Compute `eliminate` as a loop over the columns, natively as `_triangularise_by_loop`."""
+    n = len(covariance)
+
+    def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take column j off what is left of P, and put it into L and its pivot into d."""
+        rest, lower, variances = carry
+        d = _bound_below(rest[j, j], least[j])
+        share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)
+        return rest - jnp.outer(share, rest[j]), *insert_column(j, lower, share, variances, d)
+
+    start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
+    _, lower, variances = lax.fori_loop(0, n, body, start)
+    return WeightedColumns(lower, variances)
+
+
+def insert_column(
+    j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Insert column j of L below its diagonal and entry j of d, at a place that a loop counts."""
+    here = np.arange(len(variances)) == j
+    return jnp.where(here, lower + share[:, None], lower), jnp.where(here, d, variances)

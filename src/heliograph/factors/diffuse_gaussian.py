@@ -1,0 +1,254 @@
+"""Gaussians of which some directions are unknown: the limit of P + kappa P_inf, by factors of two levels.
+
+One unit lower L, whose columns are infinite (d_inf) or finite (d). What else an infinite column has vanishes in the
+limit, so that this is exact. An operation is the one of `factored_gaussian.py` where no column is infinite.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    below_diagonal,
+    decorrelate,
+    reciprocal_or_zero,
+    unit_lower,
+)
+from heliograph.factors.factored_gaussian import BackwardGain, Gaussian
+from heliograph.factors.repeated_measurements import triangularise_noise
+from heliograph.numerics.gaussian_density import LOG_TURN
+from heliograph.numerics.types import Float
+
+FALLEN = 1e-12  # of what a row had in infinite columns: less is rounding
+DEAF = 1e-9  # of |L_j|'|h|: a measurement that hears less of a direction hears nothing of it
+
+
+class Diffuse(NamedTuple):
+    """Mean m and covariance L (diag(d) + kappa diag(d_inf)) L' in the limit of a large kappa.
+
+    Of each column one of the two is zero. Shapes: mean, variances d, infinite d_inf (n,), lower (n (n - 1) / 2,).
+    """
+
+    mean: Float[jax.Array, "*time n"]
+    lower: Float[jax.Array, "*time entries"]
+    variances: Float[jax.Array, "*time n"]
+    infinite: Float[jax.Array, "*time n"]
+
+    @property
+    def root(self) -> jax.Array:
+        """Lower triangular factor L (n, n) with ones on its diagonal."""
+        return jnp.asarray(unit_lower(self.lower))
+
+    @property
+    def unknown(self) -> jax.Array:
+        """Return which components have an infinite variance, (n,)."""
+        return jnp.any((self.root != 0) & (self.infinite > 0), axis=1)
+
+    @property
+    def covariance(self) -> jax.Array:
+        """Covariance (n, n): of what is unknown infinite on the diagonal and 0 beside it."""
+        root = self.root
+        return mark_unknown((root * self.variances) @ root.T, self.unknown)
+
+
+def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
+    """Return the covariance (m, m), of unknown components infinite on the diagonal and 0 beside it."""
+    infinite = jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
+    return jnp.where(unknown[:, None] | unknown, infinite, covariance)
+
+
+def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the covariance of H x (m, m) by what is known, and which components hear an unknown direction (m,)."""
+    slopes, reach = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
+    unknown = jnp.any((jnp.abs(slopes) > DEAF * reach) & (x.infinite > 0), axis=1)
+    return (slopes * x.variances) @ slopes.T, unknown
+
+
+class FiniteAndInfiniteWeights(NamedTuple):
+    """Weights of columns (c,): finite ones, and infinite ones."""
+
+    finite: jax.Array
+    infinite: jax.Array
+
+
+def triangularise_both_levels(
+    rows: jax.Array, weights: FiniteAndInfiniteWeights, count: int, whole: jax.Array | None = None
+) -> tuple[jax.Array, FiniteAndInfiniteWeights, jax.Array]:
+    """Make the first `count` rows (c columns) orthogonal in the weights w, from the first down.
+
+    Row j, a, has s = sum of w a^2 over infinite columns. Where more than rounding is left of s, L_ij follows from these
+    columns alone, and d_inf,j = s; else their part of the row is put to 0, and the finite columns count. Each row i
+    below loses L_ij row j.
+
+    Args:
+        rows: (rows, c).
+        weights: of the columns (c,).
+        count: how many rows are made orthogonal.
+        whole: what the rows had in infinite columns, of which the rest may be rounding (rows,); all by default.
+
+    Returns:
+        L (rows, count), the weights (count,) of its columns, and what is left of the rows.
+    """
+    whole = rows**2 @ weights.infinite if whole is None else whole
+    columns, finite, infinite, numbers = [], [], [], np.arange(len(rows))
+    for j in range(count):
+        infinite_s = rows[j] ** 2 @ weights.infinite
+        is_infinite = infinite_s > FALLEN * whole[j]
+        row = jnp.where((weights.infinite > 0) & ~is_infinite, 0.0, rows[j])
+        finite_s = row**2 @ weights.finite
+        # Column j of L: what of each row below is along this one.
+        weighted = jnp.where(is_infinite, weights.infinite, weights.finite) * row
+        along = rows @ weighted * reciprocal_or_zero(jnp.where(is_infinite, infinite_s, finite_s))
+        column = jnp.where(numbers == j, 1.0, jnp.where(numbers > j, along, 0.0))
+        columns.append(column)
+        finite.append(jnp.where(is_infinite, 0.0, finite_s))
+        infinite.append(jnp.where(is_infinite, infinite_s, 0.0))
+        rows = jnp.where((numbers > j)[:, None], rows - column[:, None] * row, rows)
+    return jnp.stack(columns, axis=1), FiniteAndInfiniteWeights(jnp.stack(finite), jnp.stack(infinite)), rows
+
+
+def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
+    """Return the law of a state of which some components (n,) are unknown, the others known by columns."""
+    n = len(mean)
+    rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
+    weights = FiniteAndInfiniteWeights(
+        jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
+        jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])]),
+    )
+    lower, levels, _ = triangularise_both_levels(rows, weights, n)
+    return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
+
+
+def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
+    """Predict x over x+ = F x + b + w."""
+    rows, weights = _append_noise_columns(matrix @ x.root, x, noise)
+    lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
+    return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
+
+
+def _append_noise_columns(
+    slopes: jax.Array, x: Diffuse, noise: WeightedColumns
+) -> tuple[jax.Array, FiniteAndInfiniteWeights]:
+    """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
+
+    x gives the weights of xi, finite and infinite ones; those of omega are finite.
+    """
+    rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
+    own = jnp.asarray(noise.weights)
+    return rows, FiniteAndInfiniteWeights(
+        jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))])
+    )
+
+
+class DiffuseLikelihood(NamedTuple):
+    """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
+
+    log_likelihood: jax.Array
+    unknown: jax.Array
+
+
+def observe_diffuse(
+    x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
+) -> tuple[Diffuse, DiffuseLikelihood]:
+    """Condition x on z = H x + v; return it and what z says of the model.
+
+    A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
+    is the log of the integral of p(z | delta) over the unknown delta.
+
+    Args:
+        x: the state's law.
+        matrix: H (m, n).
+        innovation: z - H m - E v (m,), m the mean of x; NaN where a component did not arrive.
+        noise: Cov v.
+    """
+    present = ~jnp.isnan(innovation)
+    # Components with uncorrelated noises: (H, innovation) times the inverse of the noise's unit lower factor. What did
+    # not arrive is a row of zeros with the noise 1, which says nothing.
+    factors = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    rows = jnp.concatenate([matrix, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
+    rows = decorrelate(factors.matrix, jnp.where(present[:, None], rows, 0.0))
+    shift, density, shows_unknown = jnp.zeros_like(x.mean), jnp.asarray(0.0), []
+    state = x
+    for i in range(len(innovation)):
+        h, noise_i = rows[i, :-1], jnp.where(present[i], factors.weights[i], 1.0)
+        state, gain, s, shows = _observe_scalar(state, h, noise_i)
+        e = rows[i, -1] - h @ shift
+        shift = shift + gain * e
+        log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
+        density = density + jnp.where(present[i], log, 0.0)
+        shows_unknown.append(shows & present[i])
+    return state._replace(mean=x.mean + shift), DiffuseLikelihood(density, jnp.stack(shows_unknown))
+
+
+def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
+    """Condition x on one number z = h'x + v, Var v = `noise`, where some directions of x are unknown.
+
+    The covariance of x is L diag(d + kappa d_inf) L', kappa -> infinity: column j of L is an unknown direction where
+    d_inf,j > 0, and then d_j = 0. Bierman's steps go over the columns of L from the last to the first; f_j = h'L_j is
+    what z shows of column j. What has a factor kappa is the infinite part, and outweighs the finite one.
+
+    Returns:
+        x given z, its mean as it was; the gain (n,) by which the innovation moves the mean; the variance of z, or its
+        infinite part where z shows an unknown direction; and whether it shows one.
+
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977), for finite and infinite parts.
+    """
+    n, root = len(x.mean), x.root
+    # Sums over the columns k > j, which are done: s = noise + sum f_k^2 d_k, s_inf = sum f_k^2 d_inf,k, and `cross`,
+    # the covariance of x with z. Once z shows an unknown direction, `cross` is of the infinite part alone.
+    s, s_inf, cross = noise, jnp.zeros_like(noise), jnp.zeros(n)
+    columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
+    for j in reversed(range(n)):
+        column = columns[j]
+        f, size_of_terms = h @ column, jnp.abs(h) @ jnp.abs(column)
+        is_unknown, is_shown = d_inf[j] > 0, jnp.abs(f) > DEAF * size_of_terms
+        shows_unknown = is_unknown & is_shown
+        is_first_unknown = shows_unknown & (s_inf == 0)
+        # The sum that counts: the infinite part once z shows an unknown direction, before it the finite one.
+        leading_s = jnp.where(s_inf > 0, s_inf, s)
+        # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
+        columns[j] = jnp.where(is_unknown & ~is_shown, column, column - f * reciprocal_or_zero(leading_s) * cross)
+        next_s = s + jnp.where(is_unknown, 0.0, f**2 * d[j])
+        next_s_inf = s_inf + jnp.where(shows_unknown, f**2 * d_inf[j], 0.0)
+        # Beside an unknown direction that z shows, finite variances are nothing.
+        finite_part = jnp.where(is_unknown | (s_inf > 0), 0.0, d[j] * f)
+        cross = jnp.where(is_first_unknown, 0.0, cross) + column * jnp.where(shows_unknown, d_inf[j] * f, finite_part)
+        # d_j s_{j+1} / s_j, of either part; the first unknown direction that z shows has the variance s / f^2 after it.
+        shrunk = jnp.where(s_inf > 0, d[j], d[j] * s * reciprocal_or_zero(next_s))
+        d[j] = jnp.where(is_unknown, jnp.where(is_first_unknown, s * reciprocal_or_zero(f**2), 0.0), shrunk)
+        shrunk_inf = jnp.where(shows_unknown, d_inf[j] * s_inf * reciprocal_or_zero(next_s_inf), d_inf[j])
+        d_inf[j] = jnp.where(is_first_unknown, 0.0, shrunk_inf)
+        s, s_inf = jnp.where(s_inf > 0, s, next_s), next_s_inf
+    variance = jnp.where(s_inf > 0, s_inf, s)
+    observed = Diffuse(x.mean, below_diagonal(jnp.stack(columns, axis=1)), jnp.stack(d), jnp.stack(d_inf))
+    return observed, cross * reciprocal_or_zero(variance), variance, s_inf > 0
+
+
+def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
+    """Return the regression of x on the next state x+ = F x + b + w, of what both levels know.
+
+    What of x stays unknown given x+ has a variance that is no number, and so have the estimates that rest on it.
+
+    Args:
+        x: the state before the step.
+        matrix: F.
+        ahead: mean of x+, F m + b.
+        noise: columns of Cov w.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+    n = len(x.mean)
+    moved, weights = _append_noise_columns(matrix @ x.root, x, noise)
+    own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
+    lower, _, rest = triangularise_both_levels(jnp.concatenate([moved, own]), weights, n)
+    left, levels, _ = triangularise_both_levels(rest[n:], weights, n, own**2 @ weights.infinite)
+    law = Gaussian(x.mean, below_diagonal(left), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
+    return BackwardGain(law, lower[n:], ahead, below_diagonal(lower[:n]))
+
+
+def as_gaussian(x: Diffuse) -> Gaussian:
+    """Return what is known of it as a Gaussian; the variance of an unknown direction is no number."""
+    return Gaussian(x.mean, x.lower, jnp.where(x.infinite > 0, jnp.nan, x.variances))

@@ -1,0 +1,379 @@
+"""A Gaussian by its mean and the factors L diag(d) L' of its covariance, and the operations that filters are made of.
+
+With x = m + L xi, xi uncorrelated with variances d, everything is said by slopes in xi: of F x they are F L, of a
+measurement H x they are H L. Sums of independent terms are columns side by side (`covariance_factors.py`). No operation
+takes the difference of two variances, and none has a branch: a component of variance zero has a reciprocal of zero.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    add_columns_to_factors,
+    below_diagonal,
+    decorrelate,
+    eliminate,
+    factor_known_covariance,
+    join_columns,
+    reciprocal_or_one,
+    reciprocal_or_zero,
+    rounding_of_pivots,
+    triangularise,
+    unit_lower,
+    zero_covariance,
+)
+from heliograph.factors.repeated_measurements import (
+    rounding_of_products,
+    rounding_of_slopes,
+    triangularise_noise,
+)
+from heliograph.factors.scalar_update import (
+    update_by_parts,
+    update_by_row,
+    update_by_rows,
+    update_by_scalar_given_products,
+    update_root_columns,
+)
+from heliograph.numerics.gaussian_density import LOG_TURN
+from heliograph.numerics.linalg import OFF_SUPPORT, OFF_VALUE, PIVOT_TOLERANCE, rounding, symmetric
+from heliograph.numerics.numpy_or_jax import is_traced, library
+from heliograph.numerics.trace_settings import writes_short_programs
+from heliograph.numerics.types import Array, Float
+
+
+class Gaussian(NamedTuple):
+    """Mean m and covariance L diag(d) L'.
+
+    Shapes: mean (n,), lower (n (n - 1) / 2,) the entries of L below its diagonal row by row, variances d (n,); leading
+    axes for several.
+    """
+
+    mean: Float[jax.Array, "... n"]
+    lower: Float[jax.Array, "... entries"]
+    variances: Float[jax.Array, "... n"]
+
+    @property
+    def root(self) -> Any:
+        """L (..., n, n), NumPy's or JAX's as the entries are."""
+        return unit_lower(self.lower)
+
+    @property
+    def columns(self) -> WeightedColumns:
+        """Covariance as the columns of L with weights d."""
+        return WeightedColumns(self.root, self.variances)
+
+    @property
+    def covariance(self) -> Any:
+        """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are."""
+        xp = library(self)
+        root, variances = (xp.asarray(part) for part in (self.root, self.variances))
+        product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
+        upper = np.triu(np.ones(product.shape[-2:], bool))
+        return xp.where(upper, product, xp.swapaxes(product, -1, -2))
+
+
+def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
+    """Return the Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
+    factors = triangularise(columns)
+    return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
+
+
+def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
+    """Return the Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
+    total = parts[0].covariance
+    for part in parts[1:]:
+        total = total + part.covariance
+    return from_covariance_by_elimination(mean, total)
+
+
+def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
+    """Return the Gaussian of a covariance matrix that was summed of squares, by elimination."""
+    factors = eliminate(covariance, rounding_of_pivots(covariance))
+    return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
+
+
+def from_covariance(mean: Array, covariance: Array) -> Gaussian:
+    """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
+    if isinstance(covariance, np.ndarray):
+        factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_known_covariance(covariance))
+        return Gaussian(*factors)
+    columns = eliminate(jnp.asarray(covariance), rounding_of_pivots(covariance))
+    return Gaussian(jnp.asarray(mean), below_diagonal(columns.matrix), columns.weights)
+
+
+def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
+    """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+    return from_columns(
+        jnp.asarray(matrix @ x.mean + shift), join_columns(WeightedColumns(matrix @ x.root, x.variances), noise)
+    )
+
+
+class Image(NamedTuple):
+    """f(x) of x = m + L xi, to second moments: mean + slopes xi + what is uncorrelated with xi.
+
+    `explained` is slopes diag(d) slopes'. Column j of its matrix is slopes_j times `unit`_j, what f moves by while xi_j
+    moves by that: points give that difference itself.
+
+    Shapes: mean (p,), explained (p, n), unit (n,), curvature (p, columns), the last a sum of squares.
+    """
+
+    mean: Float[jax.Array, " p"]
+    explained: WeightedColumns
+    unit: Float[Array, " n"]
+    curvature: WeightedColumns
+
+    @property
+    def slopes(self) -> jax.Array:
+        """Slopes in xi, 0 in what is known, (p, n)."""
+        return jnp.asarray(self.explained.matrix * reciprocal_or_zero(jnp.asarray(self.unit)))
+
+    @property
+    def columns(self) -> WeightedColumns:
+        """Covariance of f(x), as columns with their weights."""
+        return join_columns(self.explained, self.curvature)
+
+
+def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: WeightedColumns | None = None) -> Image:
+    """Return the image of an f of which the slopes in xi are computed, affine where it has no curvature."""
+    rest = zero_covariance(len(mean)) if curvature is None else curvature
+    return Image(mean, WeightedColumns(slopes, x.variances), np.ones(len(x.mean)), rest)
+
+
+def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: WeightedColumns) -> Gaussian:
+    """Return the law of (x, t) with t = mean + slopes xi + v: its factors are [[L, 0], [slopes, N]] and (d, r).
+
+    `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
+    """
+    root = jnp.concatenate([jnp.pad(x.root, ((0, 0), (0, len(mean)))), jnp.concatenate([slopes, noise.matrix], axis=1)])
+    variances = jnp.concatenate([x.variances, noise.weights])
+    return Gaussian(jnp.concatenate([x.mean, mean]), below_diagonal(root), variances)
+
+
+def take_leading(x: Gaussian, n: int) -> Gaussian:
+    """Return the marginal Gaussian of the first n components: the first rows of L."""
+    return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
+
+
+def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
+    """Return n columns of Cov (f(x) + w) beside its slopes: curvature + Cov w, `noise` as of `triangularise`."""
+    return from_summed_covariance(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
+
+
+def add_noise_to_image(image: Image, noise: WeightedColumns) -> Gaussian:
+    """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
+
+    `noise` holds factors of Cov w, L unit lower.
+    Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
+    """
+    if writes_short_programs():
+        factors = add_columns_to_factors(noise, image.columns)
+        return Gaussian(image.mean, below_diagonal(factors.matrix), factors.weights)
+    return from_columns(image.mean, join_columns(image.explained, sum_unexplained(image, noise)))
+
+
+class Innovations(NamedTuple):
+    """Innovations of a measurement's components, each given those before it: uncorrelated; 0 of what did not arrive.
+
+    value (m,), variance (m,), and whole (m,): the variance of the component by itself.
+    """
+
+    value: Float[jax.Array, " m"]
+    variance: Float[jax.Array, " m"]
+    whole: Float[jax.Array, " m"]
+
+    @property
+    def determined(self) -> jax.Array:
+        """Return which components those before them determine, to rounding (m,)."""
+        return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
+
+    def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
+        """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
+
+        A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
+        -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
+        """
+        determined = self.determined
+        safe = jnp.where(determined, 1.0, self.variance)
+        density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
+        reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
+        agrees = jnp.where(jnp.abs(self.value) <= reach, 0.0, -jnp.inf)
+        return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
+
+
+def condition_on_observation(
+    x: Gaussian, slopes: jax.Array, innovation: jax.Array, noise: WeightedColumns, present: jax.Array | None = None
+) -> tuple[Gaussian, Innovations]:
+    """Condition x = m + L xi on z = E z + slopes xi + v, given z - E z.
+
+    Component after component of N^-1 z, where Cov v = N diag(r) N': their noises are uncorrelated. Shapes: slopes
+    (m, n), innovation (m,), noise (m, columns), present (m,): which components arrived, by default those whose
+    innovation is a number.
+    """
+    n = len(x.mean)
+    present = ~jnp.isnan(innovation) if present is None else present
+    # Rows (slopes, innovation) of what arrived, with uncorrelated noises.
+    fresh = triangularise_noise(WeightedColumns(jnp.where(present[:, None], noise.matrix, 0.0), noise.weights))
+    rows = jnp.concatenate([slopes, jnp.where(present, innovation, 0.0)[:, None]], axis=1)
+    rows = jnp.where(present[:, None], rows, 0.0)
+    whole = rows[:, :n] ** 2 @ x.variances + fresh.matrix**2 @ fresh.weights
+    rows, variance = decorrelate(fresh.matrix, rows), jnp.where(present, fresh.weights, 1.0)
+    least = rounding_of_slopes(n, fresh.matrix, whole)
+    # The rows of L, and below them those of the components to come, change alike; so do the mean and the innovations.
+    root, news = jnp.concatenate([x.root, rows[:, :n]]), jnp.concatenate([x.mean, -rows[:, n]])
+    root, d, news, values, totals = update_by_rows(root, x.variances, news, variance, least)
+    return Gaussian(news[:n], below_diagonal(root[:n]), d), Innovations(values, totals, whole)
+
+
+def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array:
+    """Return Kalman's gain (n, m) of z = E z + slopes xi + v, of the factors N diag(r) N' of Cov v, N unit lower.
+
+    With V the unit triangle by which a component's innovation, given those before it, enters those to come, these
+    innovations are V^-1 N^-1 (z - E z), and the gain is that of them times V^-1 N^-1.
+    """
+    n, rows = len(x.mean), decorrelate(noise.matrix, slopes)
+    weights = jnp.asarray(noise.weights)
+    least = rounding_of_slopes(n, noise.matrix, slopes**2 @ x.variances + noise.matrix**2 @ weights)
+
+    def measure_part(
+        i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Measure component i: return the rows and variances after it, and its gain."""
+        return update_by_row(root, d, root[n + i], weights[i], rounding)[:3]
+
+    *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
+    entering = unit_lower(below_diagonal(gains[n:]))
+    return gains[:n] @ decorrelate(entering, decorrelate(noise.matrix, jnp.eye(len(rows))))
+
+
+def correct_by_gain(
+    x: Gaussian, slopes: jax.Array, noise: WeightedColumns, gain: jax.Array, innovation: jax.Array
+) -> Gaussian:
+    """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
+
+    Joseph's form, sums of squares; with Kalman's gain it is `condition_on_observation`.
+    """
+    left = WeightedColumns(x.root - gain @ slopes, x.variances)
+    return from_columns(x.mean + gain @ innovation, join_columns(left, noise.through(gain)))
+
+
+def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+    """Change the mean and variance of t = E t + row xi, and with them x, whose law given t stays: rank one in L, d.
+
+    The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
+    of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
+    s_j = ratio sum_{k < j} f_k^2 d_k + sum_{k >= j} f_k^2 d_k: d_j+ = d_j s_{j+1} / s_j and
+    L_j+ = L_j - (1 - ratio) (f_j / s_{j+1}) sum_{k > j} d_k f_k L_k. Ratios of sums of positive terms, whether the
+    ratio is below 1 or above. Where V is 0, x stays as it is.
+
+    Shapes: row (n,), shift and ratio () and ratio >= 0.
+
+    Source: Agee and Turner, Triangular decomposition of a positive definite matrix plus a symmetric dyad (1972), with
+    the sums of an observation of ratio r / (V + r).
+    """
+    product = x.variances * row
+    power = row * product
+    before = jnp.append(0.0, lax.cumsum(power))
+    s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
+    root, variances, w = update_root_columns(x.root, x.variances, product, (1 - ratio) * row, s)
+    return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
+
+
+def moments_of_mixture(
+    means: Float[jax.Array, "parts n"], covariances: Float[jax.Array, "parts n n"], weights: Float[jax.Array, " parts"]
+) -> tuple[jax.Array, jax.Array]:
+    """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
+
+    Means are taken about the first: of some so large that all are equal nothing is left, and no rounding to be squared.
+    """
+    about = means - means[0]
+    shift = weights @ about
+    within = jnp.reshape(weights @ covariances.reshape(len(weights), -1), covariances.shape[1:])
+    return means[0] + shift, symmetric(within + WeightedColumns((about - shift).T, weights).covariance)
+
+
+def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
+    """Merge a mixture into one Gaussian of its moments; `parts` have a leading axis."""
+    return from_covariance_by_elimination(*moments_of_mixture(parts.mean, parts.covariance, weights))
+
+
+class BackwardGain(NamedTuple):
+    """Regression of x on the next state x+ = m+ + L e: x = m + K e + a noise uncorrelated with e.
+
+    J = K L^-1 of Rauch's form is never formed: a part of e that is nearly nothing has a large column of K, which would
+    be spread over all of J, to cancel again.
+
+    Shapes: left the Gaussian of mean m and the covariance of the noise, gain K (n, n), ahead m+ = E x+ (n,), lower
+    (n (n - 1) / 2,) of L.
+    """
+
+    left: Gaussian
+    gain: Float[jax.Array, "*time n n"]
+    ahead: Float[jax.Array, "*time n"]
+    lower: Float[jax.Array, "*time entries"]
+
+    def mean_given(self, later: jax.Array) -> jax.Array:
+        """Return E x, from that of x+."""
+        return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
+
+    def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
+        """Return L^-1 times rows (n, ...)."""
+        return decorrelate(unit_lower(self.lower), rows)
+
+
+def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
+    """Return the regression of a state x on the next one, x+, by measuring x+ part by part.
+
+    x = m + L_x xi and x+ = ahead + slopes xi + N omega have together the factors [[L_x, 0], [slopes, N]], with the
+    variances d of xi and r of omega. Each part of x+ is measured without a noise but omega: its innovation, given those
+    before it, is a part of e, its gain a column of K for x and of L for the parts of x+ to come.
+
+    Args:
+        x: the state's Gaussian, with L_x (n, n) and d (n,).
+        slopes: of x+ in xi, (n, n).
+        ahead: the mean of x+, (n,).
+        noise: N (n, n), unit lower triangular, as `triangularise` makes it, and r (n,).
+
+    Returns:
+        What is left of x given x+, K, the mean of x+, and L.
+    """
+    n, root = len(x.mean), jnp.concatenate([x.root, slopes])
+    variances_of_next = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
+    rounding_of_next = rounding_of_products(n, variances_of_next)
+    omega_rows, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
+
+    def measure_part(
+        i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Measure part i of x+: return the rows and variances after it, and its gain."""
+        # N is unit lower triangular, so part i is the first that omega_i is in, and the parts before it have determined
+        # omega_0 ... omega_i-1. So it takes one more column than xi has: that of omega_i, with the slope 1 in part i.
+        f, column, r = root[n + i], omega_rows[:, i], weights[i]
+        product = d * f
+        power = f * product
+        # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
+        depends_on_xi = jnp.sum(power) > rounding
+        products = jnp.append(jnp.where(depends_on_xi, product, 0.0), r)
+        powers = jnp.append(jnp.where(depends_on_xi, power, 0.0), r)
+        rows = jnp.concatenate([root, column[:, None]], axis=1)
+        rows, d, gain, _ = update_by_scalar_given_products(
+            rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)
+        )
+        return rows[:, :n], d[:n], gain
+
+    root, d, gains = update_by_parts(measure_part, root, x.variances, rounding_of_next)
+    left = Gaussian(x.mean, below_diagonal(root[:n]), d)
+    return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
+
+
+def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
+    """Smooth x by the smoothed next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+    carried = WeightedColumns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
+    return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))

@@ -1,0 +1,47 @@
+"""A Gaussian whose mean is a high part and a low one, for precisions in which its place takes its digits."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance
+from heliograph.numerics.compensated_arithmetic import split_sum
+from heliograph.numerics.types import Array, Float
+
+
+class SplitMeanGaussian(NamedTuple):
+    """Mean high + low, where high is the mean as it is rounded, and covariance L diag(d) L'.
+
+    Shapes: high and low (n,), lower (n (n - 1) / 2,) of L, variances d (n,).
+    """
+
+    high: Float[jax.Array, " n"]
+    low: Float[jax.Array, " n"]
+    lower: Float[jax.Array, " entries"]
+    variances: Float[jax.Array, " n"]
+
+    @property
+    def about_center(self) -> Gaussian:
+        """Return the law of x - high."""
+        return Gaussian(self.low, self.lower, self.variances)
+
+
+def center_gaussian(center: jax.Array, x: Gaussian) -> SplitMeanGaussian:
+    """Return the law of center + x."""
+    mean = split_sum(center, x.mean)
+    return SplitMeanGaussian(mean.high, jnp.asarray(mean.low), x.lower, x.variances)
+
+
+def center_known(x: Gaussian) -> SplitMeanGaussian:
+    """Return a law of known numbers about its mean as single precision has it."""
+    mean = np.asarray(x.mean, np.float64)
+    high = mean.astype(np.float32).astype(np.float64)
+    return SplitMeanGaussian(jnp.asarray(high), jnp.asarray(mean - high), x.lower, x.variances)
+
+
+def centred_from_covariance(mean: Array, covariance: Array) -> SplitMeanGaussian:
+    """Return the law of a mean that the precision has, and of a covariance matrix."""
+    x = from_covariance(mean, covariance)
+    return SplitMeanGaussian(jnp.asarray(mean), jnp.zeros_like(x.mean), x.lower, x.variances)

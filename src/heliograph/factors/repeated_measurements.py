@@ -1,0 +1,113 @@
+"""Measured components that repeat others, noise included: what rounding leaves of them carries no information.
+
+Take away from such a component what those before it say: its slopes and its noise are differences of equal numbers,
+zero, of which rounding leaves some eps. Its own noise, the rounding of numbers, is as small, so that slopes of some eps
+would be information, and a noise of some eps would be correlated with those to come.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from heliograph.factors.covariance_factors import (
+    RANK,
+    ROUNDING_UNITS,
+    WeightedColumns,
+    assemble_factors,
+    column_below_diagonal,
+    insert_column,
+    reciprocal_or_one,
+    triangularise,
+    unit_of,
+)
+from heliograph.numerics.linalg import WRITTEN, outer, scale
+from straightline import operation
+
+
+def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
+    """Triangularise the noises of m components, of which those that repeat others keep nothing but their own.
+
+    With w_i = W_i - sum_j L_ij w_j: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is zero, where components
+    follow that might be correlated with it.
+    """
+    if len(noise.matrix) < 3:
+        return triangularise(noise)
+    matrix, weights = jnp.asarray(noise.matrix), jnp.asarray(noise.weights)
+    return (_triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row)(matrix, weights)
+
+
+def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
+    """Return the variance by the rounding of n slopes, each a sum of n products, of rows of these variances."""
+    rounding: jax.Array = (ROUNDING_UNITS * n * unit_of(variance)) ** 2 * variance
+    return rounding
+
+
+def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
+    """Return the variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding.
+
+    `whole` holds the variances (m,) of the rows s_i. It is ROUNDING_UNITS n eps of each s_i, from which measuring takes
+    what was known, and RANK of what is subtracted: a correlation of noises is not known to more.
+    """
+    share, below = max(ROUNDING_UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
+    return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
+
+
+def noise_beside_rounding(n: int, least: jax.Array) -> jax.Array:
+    """Return a noise beside which n slopes of a variance up to `least` say nothing: 1,024 times what they round.
+
+    An innovation as large as its deviation moves a mean by n eps / 256 of its own; single precision holds the noise.
+    """
+    return 1024 / (ROUNDING_UNITS * n * unit_of(least)) ** 2 * least
+
+
+def _set_rounding_to_zero(numbers: jax.Array, least: jax.Array) -> jax.Array:
+    """Return numbers, and zero where they are no larger than `least`; NaN stays."""
+    return jnp.where(jnp.abs(numbers) <= least, 0.0, numbers)
+
+
+def _triangularise_row_by_row(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
+    """Factor L diag(d) L' = A diag(w) A' by Gram-Schmidt, written out row by row, for `triangularise_noise`.
+
+    Args:
+        rows: A (m, columns).
+        weights: w (columns,).
+    """
+    m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
+    size = jnp.abs(rows)  # of each entry, with the sizes of all that was taken off it
+    lower, variances = list[jax.Array](), list[jax.Array]()
+    for j in range(m):
+        row = lax.index_in_dim(rows, j, keepdims=False)
+        if 0 < j < m - 1:  # nothing was taken off the first one, and nothing follows the last
+            row = _set_rounding_to_zero(row, share * lax.index_in_dim(size, j, keepdims=False))
+        weighted = scale(weights, row)
+        variances.append(lax.dot(row, weighted))
+        # Column j of L: how much of the row is in each row below it, which is taken off there.
+        over = lax.reshape(reciprocal_or_one(variances[j]), (1,))
+        below = column_below_diagonal(j, outer(lax.dot(rows, weighted), over))
+        rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
+        lower.append(below)
+    return assemble_factors(lower, variances, rows.dtype)
+
+
+@operation(_triangularise_row_by_row)
+def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColumns:
+    """Factor L diag(d) L' = A diag(w) A' by the steps of `_triangularise_row_by_row` in a loop, of many rows."""
+    m, share = len(rows), max(ROUNDING_UNITS * rows.shape[1] * unit_of(rows), RANK)
+
+    def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """Take row j, its rounding set to 0, off the rows below it; put column j into L and its variance into d.
+
+        Carried are what is left of the rows of A, the `size` of each entry with all that was taken off it, L and d.
+        """
+        rows, size, lower, variances = carry
+        row = _set_rounding_to_zero(rows[j], share * size[j])
+        weighted = weights * row
+        d = row @ weighted
+        below = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
+        return rows, size, *insert_column(j, lower, below, variances, d)
+
+    start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)
+    _, _, lower, variances = lax.fori_loop(0, m, eliminate_row, start)
+    return WeightedColumns(lower, variances)

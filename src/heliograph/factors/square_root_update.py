@@ -1,0 +1,119 @@
+"""Kalman's update of covariances that are known before any data, on their roots, by LAPACK's QR."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.factors.covariance_factors import RANK
+from heliograph.numerics.types import Bool, Float
+
+
+class ObservedRoot(NamedTuple):
+    """Gain K (..., n, m), and a root (..., n, columns) of the covariance after a measurement: W+ W+' = P - K S K'."""
+
+    gain: Float[np.ndarray, "*items n m"]
+    root: Float[np.ndarray, "*items n c"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "*items n n"]:
+        """Covariance W+ W+' after the observation."""
+        return covariance_of_root(self.root)
+
+
+def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
+    """Return W W', symmetric to the last digit."""
+    product = root @ root.swapaxes(-1, -2)
+    return np.asarray(product + product.swapaxes(-1, -2)) / 2
+
+
+def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
+    """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
+
+    Of a matrix that rounding made indefinite, those of the nearest covariance: what is below zero counts as zero.
+    """
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    scale = unit[..., :, None] * unit[..., None, :]
+    known = deviation[..., :, None] * deviation[..., None, :] > 0
+    values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0) / scale)
+    return np.asarray(unit[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def observe_root(
+    root: Float[np.ndarray, "*items n c"],
+    output: Float[np.ndarray, "*items m n"],
+    noise: Float[np.ndarray, "*items m d"],
+) -> ObservedRoot:
+    """Condition x of covariance W W' on z = C x + v, Cov v = N N'; return the gain K (n, m) and a root of what is left.
+
+    [[N, C W], [0, W]] = [[V, 0], [K V, W+]] U with an orthogonal U and V V' = C W W' C' + N N': sums of squares alone,
+    each row known to eps of its length. A component of z of whose variance the components before it leave less than the
+    share RANK is dependent: it has the gain zero, since a given covariance is not known to more digits.
+
+    Args:
+        root: W, for each item.
+        output: C.
+        noise: N.
+
+    Source: Morf and Kailath, Square-root algorithms for least-squares estimation (1975).
+    """
+    (m, n), output_root = output.shape[-2:], output @ root
+    columns = noise.shape[-1] + root.shape[-1]
+    # At least as many columns as rows, so that the triangle is whole.
+    rows = np.zeros((*output_root.shape[:-2], m + n, max(columns, m + n)))
+    rows[..., :m, : noise.shape[-1]] = noise
+    rows[..., :m, noise.shape[-1] : columns] = output_root
+    rows[..., m:, noise.shape[-1] : columns] = root
+    # Dependent components are moved behind the others: what rounding left of them would else take from these.
+    independent = _find_independent_rows(rows[..., :m, :columns])
+    order = None if independent.all() else np.argsort(~independent, axis=-1, kind="stable")
+    if order is not None:
+        independent = np.take_along_axis(independent, order, axis=-1)
+        rows[..., :m, :] = np.take_along_axis(rows[..., :m, :], order[..., None], axis=-2)
+    # The triangle [[V, 0], [K V, W+]]: transposed, it is R of the rows' QR.
+    upper = np.asarray(np.linalg.qr(rows.swapaxes(-1, -2), mode="r"))
+    lower = upper.swapaxes(-1, -2)
+    v, k_v = lower[..., :m, :m], lower[..., m:, :m]
+    gain = _solve_for_gain(v, k_v, independent)
+    # The columns of K V that no gain uses stay in the root of what is left.
+    unused = np.where(independent[..., None, :], 0.0, k_v)
+    if order is not None:  # the gain's columns in the order of z again, by the inverse of the permutation
+        gain = np.take_along_axis(gain, np.argsort(order, axis=-1)[..., None, :], axis=-1)
+    return ObservedRoot(np.ascontiguousarray(gain), np.concatenate([lower[..., m:, m:], unused], axis=-1))
+
+
+def _solve_for_gain(v: np.ndarray, k_v: np.ndarray, independent: np.ndarray) -> np.ndarray:
+    """Return K (..., n, m) from the lower triangular V (..., m, m) and K V, with zeros for dependent components.
+
+    By substitution from the last column on: K_j = (K V_j - sum_i>j K_i V_ij) / V_jj.
+    """
+    pivots = np.diagonal(v, axis1=-2, axis2=-1)
+    inverse = np.where(independent, 1 / np.where(independent, pivots, 1.0), 0.0)
+    gain = np.zeros_like(k_v)
+    for j in reversed(range(v.shape[-1])):
+        remainder = k_v[..., j] - (gain[..., j + 1 :] @ v[..., j + 1 :, j, None])[..., 0]
+        gain[..., j] = remainder * inverse[..., j, None]
+    return gain
+
+
+def observe_information(
+    root: Float[np.ndarray, "*items n c"], information: Float[np.ndarray, "*items n n"]
+) -> ObservedRoot:
+    """Condition x of covariance W W' on measurements of information J = C' Cov(v)^-1 C: P+ = (P^-1 + J)^-1.
+
+    With J = U U' they say as much as U' x + v, Cov v = I; P may be singular.
+    """
+    rows = roots_of(information).swapaxes(-1, -2)
+    return observe_root(root, rows, np.eye(rows.shape[-1]))
+
+
+def _find_independent_rows(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
+    """Find which rows have more than RANK of their square left beside those before them that have, by Gram-Schmidt."""
+    rest, adds = rows, np.zeros(rows.shape[:-1], bool)
+    for j in range(rows.shape[-2]):
+        square = np.sum(rest[..., j, :] ** 2, axis=-1)
+        adds[..., j] = square > RANK * np.sum(rows[..., j, :] ** 2, axis=-1)
+        length = np.where(adds[..., j], np.sqrt(square), np.inf)
+        unit = rest[..., j, :] / length[..., None]
+        rest = rest - (rest @ unit[..., None]) @ unit[..., None, :]
+    return adds

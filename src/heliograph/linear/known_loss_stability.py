@@ -1,0 +1,263 @@
+"""Linear plants behind links whose losses the receiver knows: gains, certificates of a bounded mean error, its limits.
+
+P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next;
+after mode i it is V_i, so that U_j = sum_i T_ij V_i.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.factors.square_root_update import observe_root, roots_of
+from heliograph.linear.jump_system import JumpSystem, mix_moments_of_modes, propagate_by_mode, unpack_triangle_entries
+from heliograph.numerics.check import fail
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.types import Float, Int
+
+BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
+CONVERGED = 1e-13  # relative change of the gains from step to step
+ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
+NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
+WEIGHT = 1e-9  # probability of a mode below which it has none
+SEEN = 1e-6  # share that a mode counts with in the search for gains, if it is left for good sooner or later
+SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
+
+KindGains = tuple[Float[np.ndarray, "n _"], ...]
+Parts = Float[np.ndarray, "modes n n"]
+
+
+class KnownLossSystem(NamedTuple):
+    """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i; the receiver knows their kind s = known[i].
+
+    It receives C_s x + v, Cov(v) = R_i. `chain[i, j]` = P(next mode j | now i), `law` is the modes' law in the long
+    run.
+    The receiver cannot distinguish modes of one kind, so a gain belongs to a kind. A kind without rows is a loss.
+    """
+
+    transition: Float[np.ndarray, "n n"]
+    process: Float[np.ndarray, "n n"]
+    chain: Float[np.ndarray, "modes modes"]
+    law: Float[np.ndarray, "modes"]
+    known: Int[np.ndarray, "modes"]
+    outputs: tuple[Float[np.ndarray, "_ n"], ...]
+    noises: tuple[Float[np.ndarray, "_ _"], ...]
+
+    def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
+        """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
+
+        Raises:
+            ValueError: more entries than the limit.
+        """
+        n, modes = len(self.transition), len(self.chain)
+        size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)
+        if size > SIZE_LIMIT:
+            raise fail("chain of losses", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
+        loops = [self.transition - gains[s] @ self.outputs[s] for s in self.known]
+        added = [gains[s] @ r @ gains[s].T + self.process for s, r in zip(self.known, self.noises, strict=True)]
+        return JumpSystem(self.chain[None], np.array([loops]), noise * self.law[:, None, None] * np.array([added]))
+
+    def solve_steady_covariances(self, gains: KindGains) -> Parts:
+        """Return the steady U under gains of a radius below 1."""
+        bound: Parts = mix_moments_of_modes(self.chain, self.close_loop(gains).steady()[0])
+        return bound
+
+
+def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
+    """Return the spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
+
+    Below 1, E P stays bounded under these gains, hence under the best. The witness is V > 0 with V - V+ > 0 without
+    noise, checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
+
+    Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
+    """
+    jumps = system.close_loop(gains)
+    radius = jumps.radius()
+    if radius >= BELOW_ONE:
+        return radius
+    unit = np.broadcast_to(np.eye(len(system.transition)), jumps.maps.shape)
+    (witness,) = jumps._replace(added=unit).steady()
+    left: Parts = witness - propagate_by_mode(jumps.maps[0], mix_moments_of_modes(system.chain, witness), 0.0)
+    return radius if min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness).min()) > 0 else float("inf")
+
+
+def find_gains(system: KnownLossSystem) -> KindGains:
+    """Return a gain for each kind of mode s, that keep the mean error covariance E P bounded and small.
+
+    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. The covariance recursion of the
+    best filter, with mean covariances in place of its own, runs until its gains converge or are found to keep E P
+    bounded; policy iteration, which then converges faster, improves them. Where neither keeps E P bounded, the gains
+    A C+ are tried, with which an output that shows all of x leaves no old error.
+
+    Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
+    """
+    # A mode that the chain leaves for good sooner or later needs a gain, too: it counts with a small share.
+    system = system._replace(law=np.where(system.law > WEIGHT, system.law, SEEN))
+    gains = _iterate_covariances(system)
+    gains = _iterate_policy(system, gains)
+    if system.close_loop(gains).radius() < BELOW_ONE:
+        return gains
+    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
+    return min(gains, forgetting_gains, key=lambda candidate: system.close_loop(candidate).radius())
+
+
+def _iterate_covariances(system: KnownLossSystem) -> KindGains:
+    """Return the gains that the covariance recursion ends with: converged, certified, or of ITERATIONS steps.
+
+    Where the covariances V grow beyond all bounds, they are divided by their size, and the noises with them.
+    """
+    size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
+    parts: Parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    noise, gains = 1.0, _improve_gains(system, parts, 1.0)
+    for step in range(1, ITERATIONS + 1):
+        (parts,) = system.close_loop(gains, noise).after(parts)
+        growth = np.trace(parts.sum(axis=0)) / size
+        if growth > NEGLIGIBLE:
+            parts, noise = parts / growth, noise / growth
+        last_gains, gains = gains, _improve_gains(system, parts, noise)
+        if _relative_change(last_gains, gains) < CONVERGED:
+            break
+        # Tested after 1, 2, 4, ... steps, since it costs more than a step: do the gains keep E P bounded already?
+        is_power_of_two = step.bit_count() == 1
+        if is_power_of_two and system.close_loop(gains).radius() < BELOW_ONE:
+            break
+    return gains
+
+
+def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
+    """Return better gains by policy iteration: the best for what the last ones leave, until they stop improving.
+
+    What gains leave is their steady bound, or, where they have none, the covariances that grow fastest.
+    """
+    jumps = system.close_loop(gains)
+    values, vectors = np.linalg.eig(jumps.operator())
+    radius = float(np.max(np.abs(values)))
+    for _ in range(POLISHING):
+        is_bounded = radius < BELOW_ONE
+        parts = jumps.steady()[0] if is_bounded else _fastest_growing_covariances(jumps.shape, values, vectors)
+        next_gains = _improve_gains(system, parts, 1.0 if is_bounded else 1 / NEGLIGIBLE)
+        jumps = system.close_loop(next_gains)
+        values, vectors = np.linalg.eig(jumps.operator())
+        next_radius = float(np.max(np.abs(values)))
+        # Worse gains are dropped, and the last ones kept; so are gains that changed by rounding alone.
+        if next_radius >= max(radius, BELOW_ONE) or _relative_change(gains, next_gains) < CONVERGED:
+            break
+        gains, radius = next_gains, next_radius
+    return gains
+
+
+def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vectors: np.ndarray) -> Parts:
+    """Return the covariances that grow by the spectral radius: a positive map has such an eigenvector."""
+    parts = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
+    return np.asarray(parts / np.trace(parts.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
+
+
+def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
+    """Return the best gain of each kind for these covariances V by mode, with R and law scaled by `noise`."""
+    results: list[np.ndarray] = []
+    before: Parts = mix_moments_of_modes(system.chain, parts)
+    for s, c in enumerate(system.outputs):
+        modes = np.flatnonzero(system.known == s)
+        v = before[modes].sum(axis=0)
+        r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
+        results.append(system.transition @ observe_root(roots_of(v), c, roots_of(r)).gain)
+    return tuple(results)
+
+
+def _relative_change(before: KindGains, after: KindGains) -> float:
+    """Return the largest change of an entry of the gains, relative to the largest entry after it."""
+    size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
+    gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
+    return float(gap / size) if size > 0 else 0.0
+
+
+UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing
+SAME = 1e-7  # relative: eigenvalues closer than this are one
+SETS_LIMIT = 256  # sets of modes that are tried for one eigenvalue
+
+
+class UnobservedGrowth(NamedTuple):
+    """Growth of an eigenvector while the links stay in modes that do not observe it: |a|^2 rho(chain among these).
+
+    From 1 on, the mean error of every filter grows without end, if noise reaches the eigenvector.
+    """
+
+    growth: float
+    eigenvalue: complex
+    modes: tuple[int, ...]
+    vectors: Float[np.ndarray, "n d"]
+
+
+def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
+    """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
+    results: list[tuple[complex, np.ndarray]] = []
+    size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
+    for value in np.linalg.eigvals(matrix):
+        if value.imag >= 0 and all(abs(value - other) > SAME * size for other, _ in results):
+            _, singular, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
+            count = max(int(np.sum(singular <= SAME * size)), 1)
+            results.append((complex(value), right.conj().T[:, -count:]))
+    return results
+
+
+def find_fastest_unobserved_mode(
+    matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
+) -> UnobservedGrowth:
+    """Find the largest growth over eigenvalues and sets of modes that do not observe them.
+
+    E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
+    """
+    results = [
+        UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
+        for value, space in list_eigenspaces(matrix)
+        for modes, vectors in _find_unobserving_modes(space, outputs)
+    ]
+    no_growth = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
+    return max(results, key=lambda found: found.growth, default=no_growth)
+
+
+def _find_unobserving_modes(
+    space: np.ndarray, outputs: Sequence[np.ndarray]
+) -> list[tuple[tuple[int, ...], np.ndarray]]:
+    """List sets of modes that all miss a common eigenvector, largest for each subspace, with a basis of these."""
+    subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
+    for output in outputs:
+        for known in list(subspaces.values()):
+            smaller = _find_unobservable_part(output, known)
+            if smaller.shape[1] and len(subspaces) < SETS_LIMIT:
+                subspaces.setdefault(frozenset(_list_modes_not_observing(smaller, outputs)), smaller)
+    return [(tuple(sorted(modes)), basis) for modes, basis in subspaces.items() if modes]
+
+
+def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) -> Iterable[int]:
+    """Return the modes whose output matrix C_i maps the whole subspace to zero."""
+    return (i for i, c in enumerate(outputs) if _find_unobservable_part(c, space).shape[1] == space.shape[1])
+
+
+def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
+    """Return the part of a subspace that the rows of an output do not observe, each row taken at its own size."""
+    sizes = np.linalg.norm(output, axis=1)
+    rows = output[sizes > 0] / sizes[sizes > 0][:, None]
+    if not len(rows):
+        return space
+    _, singular, right = np.linalg.svd(rows @ space)
+    rank = int(np.sum(singular > UNSEEN))
+    return np.asarray(space @ right.conj().T[:, rank:])
+
+
+def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], noise: Float[np.ndarray, "n n"]) -> bool:
+    """Return whether the noise excites every one of these directions within n steps, n the number of states.
+
+    They are columns (n, d) in the controllable subspace, which W, A W, A^2 W, ... span, with A the `matrix` and W the
+    noise's.
+    """
+    basis, columns = np.zeros((len(matrix), 0)), noise
+    for _ in range(len(matrix)):
+        size = np.linalg.norm(columns, 2) if columns.size else 0.0
+        if size == 0:
+            break
+        left, singular, _ = np.linalg.svd(np.concatenate([basis, columns / size], axis=1), full_matrices=False)
+        basis = left[:, singular > UNSEEN * max(singular[0], 1e-300)]
+        columns = matrix @ basis
+    rest = vectors - basis @ (basis.T @ vectors)
+    return bool(np.max(np.abs(rest), initial=0.0) <= UNSEEN)

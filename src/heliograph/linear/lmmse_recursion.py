@@ -1,0 +1,237 @@
+"""The linear minimum-mean-square-error filter of a linear system, and the true error of any schedule of gains."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.factors.covariance_factors import rounding_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
+from heliograph.linear.jump_system import propagate_by_mode
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last_step
+from heliograph.model.estimate import Claim, weakest
+from heliograph.model.premises.premise import on_premise
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.types import Float
+
+SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way
+DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
+
+
+Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance and its rounding
+
+
+class NoiseRoots(NamedTuple):
+    """Roots of both noises of one step, with the rounding of what they are added to: Cov(w) = W W', Cov(v) = V V'."""
+
+    process: Float[np.ndarray, "N _"]
+    received: Float[np.ndarray, "m _"]
+
+
+class RecursionStep(NamedTuple):
+    """One step of the recursion: gain, and roots of the error covariance before and after the measurement."""
+
+    gain: Float[np.ndarray, "N m"]
+    predicted: Float[np.ndarray, "N _"]
+    root: Float[np.ndarray, "N N"]
+
+
+class CarriedRounding(NamedTuple):
+    """What rounding of the system's own covariances adds to that of the error, and its largest share of a claimed one.
+
+    `worst` is that share of a claimed variance, of all steps so far, and `when` its step.
+    """
+
+    covariance: Float[np.ndarray, "N N"]
+    worst: float
+    when: int
+
+    def after_step(self, system: LinearSystem, k: int, matrices: Steps, gains: Gains) -> "CarriedRounding":
+        """Return F X F' + (I - G C) D (I - G C)' + G R G' of the rounding X before, with that of Cov(w) and Cov(v).
+
+        An error D in Cov(w) adds as much to the error's covariance; a gain that minimises has no part in it.
+        """
+        keep = np.eye(len(gains.gain)) - gains.gain @ matrices.output
+        rounding = gains.transition @ self.covariance @ gains.transition.T
+        rounding += (keep * system.rounding[k]) @ keep.T
+        rounding += (gains.gain * system.received_rounding[k]) @ gains.gain.T
+        # Its share of each claimed variance.
+        error = np.diag(system.projection @ rounding @ system.projection.T)
+        claimed = np.maximum(np.diag(gains.covariance), error)
+        share = np.divide(error, claimed, out=np.zeros_like(error), where=error > 0)
+        worst, when = max((self.worst, self.when), (float(np.max(share, initial=0.0)), k))
+        return CarriedRounding(rounding, worst, when)
+
+
+def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
+    """Return roots of Cov(w) and Cov(v), beside those of the rounding of a state with second moments `size` before."""
+    reach = np.abs(matrices.output) @ np.sqrt(size)
+    return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, reach**2))
+
+
+def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Return a root of a noise covariance, beside that of the rounding of what the noise is added to.
+
+    `seconds` are the second moments of the numbers it is added to.
+    """
+    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
+    return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
+
+
+def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
+    """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
+
+    O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
+    """
+    predicted = np.concatenate([matrices.transition @ root, noises.process], axis=1)
+    gain, after = observe_root(predicted, matrices.output, noises.received)
+    return RecursionStep(gain, predicted, after)
+
+
+def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
+    """Return gains of the best linear filter of x = W y from z_1 ... z_k: a Kalman recursion, since w and v are white.
+
+    `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
+    "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
+
+    Args:
+        system: whose state y is estimated from its measurements z.
+        claim: of the schedule (default "exact").
+
+    Raises:
+        ValueError: an unknown claim.
+    Source: Kalman (1960), with the second moments of random coefficients in the noises.
+    """
+    instance("system", system, LinearSystem, "a LinearSystem")
+    root, gains_by_step = roots_of(system.covariance), list[Gains]()
+    second_moments = system.mean**2 + np.diag(system.covariance)
+    noises = find_noise_roots(system.step(0), second_moments)
+    rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
+    steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
+    for k in range(system.horizon):
+        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, see whether the error
+        # covariance has come to rest: then all later gains are the last ones, to rounding.
+        if k > steady_from and (k - steady_from) % SPAN == 0:
+            now = covariance_of_root(root), rounding.covariance
+            if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
+                break
+            before = now
+        matrices = system.step(k)
+        if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
+            noises = find_noise_roots(matrices, second_moments)
+        covariances = step_covariance_roots(root, matrices, noises)
+        gains, root = _make_gains(system, matrices, covariances), covariances.root
+        rounding = rounding.after_step(system, k, matrices, gains)
+        gains_by_step.append(gains)
+    over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
+    claim = _lower_unsupported_claim(claim, rounding.worst, rounding.when)
+    return on_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
+
+
+def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionStep) -> Gains:
+    """Return the gains of one step: y+ = (I - G C) A y + ... + G z, of which W y+ is the estimate, and covariances."""
+    projection, gain = system.projection, covariances.gain
+    keep = np.eye(len(gain)) - gain @ matrices.output
+    transition, offset = keep @ matrices.transition, keep @ matrices.drift - gain @ matrices.offset
+    return Gains(
+        transition,
+        gain,
+        offset,
+        output=projection @ transition,
+        direct=projection @ gain,
+        output_offset=projection @ offset,
+        expected=matrices.output @ matrices.transition,
+        expected_offset=matrices.output @ matrices.drift + matrices.offset,
+        covariance=covariance_of_root(projection @ covariances.root),
+        predicted=covariance_of_root(projection @ covariances.predicted),
+        innovation=covariance_of_root(matrices.output @ covariances.predicted) + matrices.noise,
+    )
+
+
+def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
+    """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
+
+    A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
+    and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
+    """
+    changes = [np.abs(a - b) for a, b in zip(after, before, strict=True)]
+    if not any(np.any(change) for change in changes):
+        return True
+    ratio = spectral_radius(loop) ** (2 * SPAN)
+    if ratio >= 1:
+        return False
+    left = max(1.0, ratio / (1 - ratio))
+    units = [np.sqrt(np.abs(np.diag(a))) for a in after]
+    return all(
+        np.all(left * change <= STILL * np.outer(unit, unit)) for change, unit in zip(changes, units, strict=True)
+    )
+
+
+def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
+    """Lower the claim where rounding is more than a small part (`lost`) of a claimed variance."""
+    remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
+    if lost > DIGITS_TOLERANCE:
+        warnings.warn(
+            f"lmmse: rounding is {lost:.1g} of a claimed variance at step {step}: the state's own moments have "
+            f"outgrown the error's, so the claim is nominal; {remedy}",
+            stacklevel=3,
+        )
+        return weakest([claim, "nominal"])
+    return claim
+
+
+def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
+    """Return E[(x - xhat)(x - xhat)'] over time of a schedule run on a system that it need not have been designed for.
+
+    Mean and covariance of (y, s), the system's state and the schedule's, are propagated; nothing is assumed of the
+    gains.
+
+    Args:
+        system: the world, y+ = A y + a + w and z = C y+ + c + v, of which x = W y is to be known.
+        schedule: gains for as many steps and measurements, s+ = F s + K z + f and xhat = L s + J z + d.
+
+    Raises:
+        ValueError: a system and a schedule of different lengths or measurements.
+    """
+    instance("system", system, LinearSystem, "a LinearSystem")
+    instance("schedule", schedule, Schedule, "a Schedule")
+    m, received_by_schedule = system.steps.offset.shape[-1], schedule.gains.gain.shape[-1]
+    if schedule.horizon != system.horizon or received_by_schedule != m:
+        got = f"{schedule.horizon} steps of {received_by_schedule} measurements"
+        raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
+    # Of (y, s), s a known number at the start.
+    mean, spread = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
+    q = len(system.projection)
+    covariances = []
+    for k in range(system.horizon):
+        gains = Gains(*(field[k] for field in schedule.gains))
+        mean, spread = _propagate_errors(system.step(k), gains, system.projection, mean, spread)
+        # The last q numbers are x - xhat; the first ones go on.
+        covariances.append(spread[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
+        mean, spread = mean[:-q], spread[:-q, :-q]
+    return np.array(covariances)
+
+
+def _propagate_errors(
+    step: Steps,
+    gains: Gains,
+    projection: Float[np.ndarray, "q N"],
+    mean: Float[np.ndarray, " joint"],
+    spread: Float[np.ndarray, "joint joint"],
+) -> tuple[Float[np.ndarray, " next"], Float[np.ndarray, "next next"]]:
+    """Return mean and covariance of (y+, s+, x - xhat) after a step from those of (y, s) before it.
+
+    With z = C y+ + c + v: s+ = F s + K z + f and x - xhat = W y+ - L s - J z - d, so that three matrices lead to
+    (y+, s+, x - xhat): `of_next` from y+, `of_noise` from c + v, and `of_schedule` from s.
+    """
+    size, m = len(step.transition), len(step.noise)
+    states = len(mean) - size
+    of_next = np.concatenate([np.eye(size), gains.gain @ step.output, projection - gains.direct @ step.output])
+    of_noise = np.concatenate([np.zeros((size, m)), gains.gain, -gains.direct])
+    of_schedule = np.concatenate([np.zeros((size, states)), gains.transition, -gains.output])
+    offset = np.concatenate([np.zeros(size), gains.offset, -gains.output_offset])
+    maps = np.concatenate([of_next @ step.transition, of_schedule], axis=1)  # from (y, s)
+    mean = maps @ mean + of_next @ step.drift + of_noise @ step.offset + offset
+    noise = propagate_by_mode(of_next, step.process, propagate_by_mode(of_noise, step.noise, 0.0))
+    return mean, propagate_by_mode(maps, spread, noise)

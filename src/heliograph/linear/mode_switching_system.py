@@ -1,0 +1,129 @@
+"""Linear system of a state whose motion and measurement are maps with the same modes."""
+
+import numpy as np
+
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
+from heliograph.linear.plant_and_measurement_maps import list_checked_steps
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.numerics.check import array, covariance, fail
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.base import AbstractRandomAffine, check_maps
+from heliograph.random_affine.memories_of_channels import memories
+from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.moments.second_moments import nominal_spread
+from heliograph.random_affine.series_and_stack import Stack
+
+Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
+
+
+def modal_system(
+    move: Channel,
+    measure: Channel,
+    initial_mean: "Float[ArrayLike, ' n']",
+    initial_covariance: "Float[ArrayLike, 'n n']",
+    horizon: int,
+    projection: "Float[ArrayLike, 'q n'] | None" = None,
+) -> LinearSystem:
+    """Return the system of y 1{mode} for a state y+ = `move`(y) and z = `measure`(y+), both random affine maps.
+
+    Its state stacks y~ = (y, 1) times the indicator 1{j} of each joint mode j of the two maps' memories; the modes are
+    a chain, Pi[i, j] = P(next mode j | mode i).
+
+    A plant that depends on a mode is a `move` with modes; a relay that filters behind a shared fading is a `move` of
+    (x, its estimate), and the receiver behind the same fading a `measure` with the same chain. With H_j the move in
+    mode j, F[j, i] = Pi[i, j] E H_j and Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl
+    sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}], where Spread_j(E[y~ y~']) is what the randomness of H_j itself adds
+    to Cov(H_j y~). The two maps of a step are independent given its modes.
+    `LinearSystemFilter` filters the result, exactly.
+
+    Args:
+        move: motion of y, from n to n numbers; its memories are chains.
+        measure: measurement of y.
+        initial_mean: mean of y before the first step (n,).
+        initial_covariance: its covariance (n, n).
+        horizon: number of steps.
+        projection: matrix W (q, n) of the estimated W y; all of y unless given.
+
+    Raises:
+        ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
+            closed), fewer steps than the horizon.
+    """
+    n = _find_state_size(move, measure)
+    # Homogeneous coordinates y~ = (y, 1).
+    mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
+    spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
+    wanted = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
+    pairs = zip(list_checked_steps(move, horizon), list_checked_steps(measure, horizon), strict=True)
+    modes_by_step = [joint_modes(Stack(pair)) for pair in pairs]
+    # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start, where the chain of the modes has not moved yet.
+    law, chain = np.asarray(modes_by_step[0].initial), np.eye(len(modes_by_step[0].initial))
+    moments = law[:, None, None] * (np.outer(mean, mean) + spread)
+    start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
+    steps = list[Steps]()
+    for modes in modes_by_step:
+        # Of the pair (move, measure) in each mode: moments of either.
+        moves, measures = zip(*(m.maps for m in modes.maps if isinstance(m, Stack)), strict=True)
+        transition, process, moments = _propagate_modes(_take_moments_by_mode(list(moves)), chain, moments)
+        measure_mean, measure_spread = _take_moments_by_mode(list(measures))
+        noise = np.einsum("jabcd,jcd->ab", measure_spread, moments)  # Cov(v) = sum_j Spread_j(E_j)
+        output = np.concatenate(list(measure_mean), axis=1)
+        no_drift, no_offset = np.zeros(len(transition)), np.zeros(len(output))
+        steps.append(Steps(transition, no_drift, process, output, no_offset, noise))
+        chain = np.asarray(modes.transition)
+    return LinearSystem(
+        Steps(*map(np.array, zip(*steps, strict=True))),
+        mean=np.kron(law, mean),
+        covariance=start,
+        projection=np.tile(np.pad(wanted, ((0, 0), (0, 1))), (1, len(law))),
+    )
+
+
+def _find_state_size(move: Channel, measure: Channel) -> int:
+    """Return n of a move from n to n numbers and a measurement of n numbers.
+
+    Raises:
+        ValueError: maps of other sizes, or gains in `move` that drift.
+    """
+    for what, affine in (("move", move), ("measure", measure)):
+        check_maps(what, [first(affine)])
+    n = int(first(move).inputs)
+    sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
+    for name, size in sizes.items():
+        if size != n:
+            raise fail(name, f"{n}, the move's inputs", size)
+    if any(memory.drifts for memory in memories(move).values()):
+        raise fail("move", "chains as its memories", "a gain that drifts")
+    return n
+
+
+def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
+    """Return E[(G, n)] and the covariances of its entries, of the map of each mode."""
+    means, spreads = zip(*((m.moments(1).mean[:-1], nominal_spread(m).center) for m in maps), strict=True)
+    return np.array(means), np.array(spreads)
+
+
+def _propagate_modes(
+    move: Moments, rows: np.ndarray, moments: np.ndarray
+) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
+    """Return F, Cov(w) and E[y~+ y~+' 1{j}] of one step, in the notation of `modal_system`.
+
+    Args:
+        move: moments of the maps by mode.
+        rows: Pi, the chain's transition.
+        moments: E_i = E[y~ y~' 1{i}] before the step.
+    """
+    mean, spread = move
+    modes, size = len(moments), moments.shape[-1]
+    # E H_j of y~ = (y, 1): the mean maps with a last row that keeps the 1.
+    whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
+    # sum_i Pi_ij E_i, and what the randomness of the maps makes of it.
+    before = mix_moments_of_modes(rows, moments)
+    of_random_maps = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
+    # Cov(w)[j, l]: Pi_ij (delta_jl - Pi_il) is the covariance of the indicators of the next modes j and l, given i.
+    indicators = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
+    process = np.einsum("ijl,jac,icd,lbd->jalb", indicators, whole, moments, whole)
+    process[np.arange(modes), :, np.arange(modes), :] += of_random_maps
+    transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
+    return transition, process.reshape(modes * size, modes * size), propagate_by_mode(whole, before, of_random_maps)

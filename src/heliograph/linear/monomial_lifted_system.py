@@ -1,0 +1,396 @@
+"""A linear model lifted to monomials: powers of the state and of the measurement, and modes, as one linear system."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.linear.plant_and_measurement_maps import (
+    PlantAndMeasurementMaps,
+    check_model,
+    make_plant_and_measurement_maps,
+)
+from heliograph.linear.system import LinearSystem, Steps, repeat_last_step
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_count, check_horizon, fail
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.monomials import (
+    MEMORY_LIMIT_ENTRIES,
+    count_monomials,
+    degrees,
+    list_exponents,
+    position,
+)
+from heliograph.random_affine.moments.pushed_moments import products_of_monomials, push_moments, push_through_known_map
+from heliograph.random_affine.noise import Gaussian, noise_moment_vector
+
+EPS = float(np.finfo(np.float64).eps)
+
+Moments = Float[np.ndarray, " monomials"]  # of (x, 1), all of one order
+
+
+def check_finite_moments(moments: Moments, k: int, order: int) -> None:
+    """Raise ValueError where moments of the state after step k are no finite numbers."""
+    if not np.all(np.isfinite(moments)):
+        got = f"ones beyond doubles at step {k + 1}: use a shorter horizon, or units in which the state is smaller"
+        raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
+
+
+class SteadyMomentTest:
+    """Test for steady moments of x up to `order` under x+ = A x + noise with one law for all time, to rounding.
+
+    What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)
+    times as much. Moments are steady once that is below the rounding of their own scale, E[x_i^2]^(1/2) for each x_i.
+    """
+
+    def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
+        rate = 1 - spectral_radius(matrix)
+        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate
+        n, places = len(matrix), position(len(matrix) + 1, order)
+        self._powers = np.array(list_exponents(n + 1, order))[:, :n]
+        self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
+        self._last: Moments | None = None
+
+    def is_steady(self, moments: Moments) -> bool:
+        """Return whether the moments are those of the call before, to rounding."""
+        before, self._last = self._last, moments
+        if before is None or self._tolerance < 0:
+            return False
+        scale = np.prod(np.sqrt(np.abs(moments[self._squares])) ** self._powers, axis=1)
+        return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
+
+
+def lift_modes(
+    plants: Sequence[GainAndNoise],
+    measurements: Sequence[JointModes],
+    degree: int,
+    moments: Float[np.ndarray, " monomials"],
+    projection: Float[np.ndarray, "n L"],
+) -> LinearSystem:
+    """Return the system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
+
+    Args:
+        plants: map x -> x+ of each step.
+        measurements: map x+ -> z of each step, with its modes.
+        degree: of the monomials.
+        moments: E[monomials of (x_0, 1)] of order 2 `degree`.
+        projection: matrix that reads x off Y.
+
+    E[Y+ 1{j}] = sum_i Pi_ij M Y 1{i} and E[Z | Y, modes] = sum_j K_j Y 1{j}, with M and K_j the moments of the plant
+    and of the route in mode j. Noises, with B = E[Y Y'] and x the Kronecker product:
+    Cov(w) = sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M' + diag(p+) x (B+ - M B M'),
+    Cov(v) = sum_j p_j (E[Z Z' | j] - K_j B+ K_j').
+    """
+    n, modes = plants[0].inputs, len(measurements[0].initial)
+    # p and Pi of the next step. The modes of the first step have the initial law, and their chain has not moved yet.
+    law, chain = np.asarray(measurements[0].initial), np.eye(modes)
+    second = products_of_monomials(moments, n + 1, degree)  # B
+    mean = np.kron(law, second[:, -1])
+    start = np.kron(np.diag(law), second) - np.outer(mean, mean)
+    # Matrices of each distinct measurement and plant once.
+    distinct = {id(measurement): measurement for measurement in measurements}
+    varies = len(distinct) > 1
+    lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
+    matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
+    # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
+    # That is not so of step 0, in which the chain does not move: the last one is at least step 1.
+    steady = SteadyMomentTest(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
+    steps, roundings, last_law = list[Steps](), list[tuple[np.ndarray, np.ndarray]](), law
+    for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
+        if steady.is_steady(moments) and np.array_equal(law, last_law) and k > 1:
+            break
+        last_law = law
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            moments = np.asarray(push_moments(plant, 2 * degree, moments))
+        check_finite_moments(moments, k, 2 * degree)
+        next_second = products_of_monomials(moments, n + 1, degree)
+        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]
+        process, law = _compute_noise_and_next_law(law, chain, matrix @ second @ matrix.T, next_second)
+        noise, rounding_of_noise = _average_noise(law, lifts, moments)
+        output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
+        no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
+        steps.append(Steps(np.kron(chain.T, matrix), no_drift, process, output, no_offset, noise))
+        roundings.append((EPS * np.kron(law, np.diag(next_second)), rounding_of_noise))
+        second, chain = next_second, np.asarray(measurement.transition)
+    over_time = Steps(*(repeat_last_step(values, len(plants)) for values in zip(*steps, strict=True)))
+    process_rounding, received_rounding = (
+        repeat_last_step(values, len(plants)) for values in zip(*roundings, strict=True)
+    )
+    whole = np.tile(projection, (1, modes))  # x is the sum over the modes of x 1{mode}
+    return LinearSystem(over_time, mean, start, whole, rounding=process_rounding, received_rounding=received_rounding)
+
+
+def _compute_noise_and_next_law(
+    law: Float[np.ndarray, " modes"],
+    chain: Float[np.ndarray, "modes modes"],
+    moved: Float[np.ndarray, "L L"],
+    second: Float[Array, "L L"],
+) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, " modes"]]:
+    """Return Cov(w) of a step of Y 1{mode}, N = modes L, and the law of the modes after it.
+
+    Args:
+        law: of the modes before the step, p.
+        chain: Pi[i, j] = P(next mode j | mode i).
+        moved: M B M', the second moments of Y that the plant's mean map makes of those before the step.
+        second: B+, those after the step.
+    """
+    # What the draw of the next mode adds, sum_i p_i (diag(Pi_i) - Pi_i' Pi_i) x M B M'; then the plant's own noise.
+    not_drawn = np.eye(len(law))[None] - chain[:, None, :]
+    drawn = np.einsum("i,ij,ijl->jl", law, chain, not_drawn)
+    next_law = law @ chain
+    kept_law = _keep_if_unchanged(law, next_law)
+    return np.kron(drawn, moved) + np.kron(np.diag(kept_law), second - moved), kept_law
+
+
+def _average_noise(
+    law: Float[np.ndarray, " modes"], lifts: "Sequence[LiftedMap]", moments: Moments
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
+    """Return the mean noise over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal.
+
+    `law` holds the modes' probabilities p_j, `lifts` each mode's map to Z, `moments` those of y.
+    """
+    spreads, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
+    return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
+
+
+def _keep_if_unchanged(
+    law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
+) -> Float[np.ndarray, " modes"]:
+    """Return the law of the modes after a step; the law before where it differs by rounding only."""
+    return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
+
+
+HIGHEST = 31  # degree: C(62, 31) is below 2^63
+STORED_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
+
+
+def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int) -> LinearSystem:
+    """Return the system of Y = monomials of x up to `degree`, measured by Z = monomials of z up to `degree`.
+
+    E[Y+ | Y] = A Y + a and E[Z | Y+] = C Y+ + c are exact, with A and C the moments of the plant and of the route,
+    Cov(w) = E[Y+ Y+'] - M E[Y Y'] M', Cov(v) = E[Z Z'] - K E[Y+ Y+'] K' (M, K with the constant). Both noises have
+    mean zero given the state's whole past, so the best linear filter of this system is the best filter of x that is
+    a polynomial of this degree in each z_k. Every monomial appears once (the half-vectorised square); x is read off as
+    the monomials of degree 1.
+
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel; behind links with memory the monomials are states for each of their modes
+            (`lift_modes`).
+        degree: 1 gives the best linear filter, 2 the quadratic one.
+        horizon: number of steps.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a plant with inputs or with noise that depends on them, parts
+            that do not fit, a lift of more than the stated memory.
+    Source: quadratic filtering with dynamical bias, equations (11) to (13) and Lemmas 3 and 4, as repaired.
+    """
+    check_model(plant, sensor, channel)
+    plant_0 = first(plant)
+    n, m = len(plant_0.states), int(first(channel).outputs)
+    refuse_lift(degree, n, m, horizon)
+    routes = make_plant_and_measurement_maps(plant, sensor, channel, 2 * degree, horizon)
+    moments = initial_monomial_moments(plant_0, 2 * degree)
+    premise = Premise(plant, sensor, channel, order=2 * degree)
+    if first(channel).remembers:
+        return on_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
+    # Start of the lifted state: E Y_0 and Cov Y_0.
+    second = products_of_monomials(moments, n + 1, degree)
+    mean, spread = mean_and_spread(second)
+    varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+    steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
+    system = LinearSystem(
+        steps,
+        mean=mean,
+        covariance=spread,
+        projection=make_linear_rows(n, degree),
+        rounding=process_rounding,
+        received_rounding=received_rounding,
+        start_rounding=EPS * np.diag(second)[:-1],
+    )
+    return on_premise(system, premise)
+
+
+def _lift_chain(
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
+) -> LinearSystem:
+    """Lift the steps of a channel with memory: to monomials times the indicator of each joint mode (`lift_modes`).
+
+    `moments` are those of x_0 up to twice the degree, `sizes` the numbers of states and of outputs.
+    """
+    n, m = sizes
+    distinct = {id(r.measurement): r.measurement for r in routes}
+    modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
+    refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
+    projection = np.pad(
+        make_linear_rows(n, degree), ((0, 0), (0, 1))
+    )  # Y ends with the constant 1, which x has no part of
+    chains = [modes_by_id[id(r.measurement)] for r in routes]
+    return lift_modes([r.plant for r in routes], chains, degree, moments, projection)
+
+
+def _lift_steps(
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
+) -> tuple[Steps, np.ndarray, np.ndarray]:
+    """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
+
+    Args:
+        routes: the maps of each step, x -> x+ and x+ -> z.
+        degree: of the monomials.
+        moments: of x_0, up to twice the degree.
+        varies: of the plant, and of the measurement, whether it differs between steps.
+
+    Returns:
+        Steps, and (time, monomials of x) and (time, monomials of z) for process and received noise. Where nothing
+        varies and the moments of the state are steady, all later steps equal the last, to rounding.
+    """
+    plant_varies, measurement_varies = varies
+    steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
+    steady = SteadyMomentTest(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
+    last: PlantAndMeasurementMaps | None = None
+    for k, route in enumerate(routes):
+        if steady.is_steady(moments):
+            break
+        # A map that equals the last step's is lifted once.
+        if last is None or not _are_identical(route.plant, last.plant):
+            plant_lift = LiftedMap(route.plant, degree, plant_varies)
+        if last is None or not _are_identical(route.measurement, last.measurement):
+            measurement_lift = LiftedMap(route.measurement, degree, measurement_varies)
+        last = route
+        # Cov(w) from the moments before the step; then the moments after it, and Cov(v) from those.
+        process, rounding_of_process = plant_lift.mean_conditional_covariance(moments)
+        moments = plant_lift.push_moments(moments)
+        check_finite_moments(moments, k, 2 * degree)
+        noise, rounding_of_noise = measurement_lift.mean_conditional_covariance(moments)
+        transition, drift = split_homogeneous(plant_lift.matrix)
+        output, offset = split_homogeneous(measurement_lift.matrix)
+        steps.append(Steps(transition, drift, process, output, offset, noise))
+        roundings.append((rounding_of_process, rounding_of_noise))
+    over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
+    process_rounding, received_rounding = (
+        repeat_last_step(values, len(routes)) for values in zip(*roundings, strict=True)
+    )
+    return over_time, process_rounding, received_rounding
+
+
+def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
+    """Return whether two models, or two of their steps, are one object or have equal numbers."""
+    return left is right or bool(eqx.tree_equal(left, right))
+
+
+class LiftedMap:
+    """A map z = G y + n on monomials: E[Z | y] = K Y, and how moments of y of twice the degree become those of z.
+
+    `matrix` is K, (monomials of z, monomials of y) up to `degree`. `whole` takes moments of y of twice the degree to
+    those of z; it is formed for a map that stays, if it is small, and None of one that varies, which is used but once.
+    `given` has the degree of each of these monomials of y, `highest` [i, j] the highest degree of moments of y that
+    Cov(Z_i, Z_j | y) needs.
+    """
+
+    def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
+        self.route, self.degree = route, degree
+        self.matrix = np.asarray(route.moments(degree).matrix)
+        rows, columns = (count_monomials(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
+        small = not varies and rows * columns <= STORED_ENTRIES
+        self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
+        self.given = degrees(route.inputs, 2 * degree)
+        # Monomials of z that hold no output of a random gain, and the highest moments of y in Cov(Z_i, Z_j | y).
+        random = ~route.known_gains
+        known = ~np.any(np.array(list_exponents(route.outputs + 1, degree))[:, :-1][:, random], axis=1)
+        lowered = degrees(route.outputs, degree) - known
+        self.highest = lowered[:, None] + lowered
+        self.highest[~known[:, None] & ~known] = 2 * degree
+
+    def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
+        """Return E[mono(z)] from E[mono(y)], both of twice the degree."""
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            if self.whole is not None:
+                return np.asarray(self.whole @ np.asarray(moments))
+            return np.asarray(push_moments(self.route, 2 * self.degree, moments))
+
+    def mean_conditional_covariance(
+        self, moments: Float[Array, "M"]
+    ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
+        """Return E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
+
+        Where the outputs in Z_i have a known gain, every term of Z_i - E[Z_i | y] has an n: it is a polynomial of y of
+        degree deg Z_i - 1, and lowers that of Cov(Z_i, Z_j | y) by one, as Z_j does. Moments of y of a higher degree,
+        which would only cancel, are left out for that entry: what y is worth, far from zero or growing, costs no digits
+        of the noise.
+        """
+        n, m = self.route.inputs + 1, self.route.outputs + 1
+        spread, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
+        for highest in range(int(self.highest.max()) + 1):
+            here = self.highest == highest
+            if not here[:-1, :-1].any():
+                continue
+            low = np.where(self.given <= highest, np.asarray(moments), 0.0)
+            after = np.asarray(products_of_monomials(self.push_moments(low), m, self.degree))
+            left = after - self.matrix @ np.asarray(products_of_monomials(low, n, self.degree)) @ self.matrix.T
+            spread = np.where(here, left, spread)
+            lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
+        return spread[:-1, :-1], lost[:-1]
+
+
+def mean_and_spread(
+    second: Float[Array, "N N"],
+) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
+    """Return the mean and covariance of y, given the second moments of (y, 1).
+
+    The diagonal is raised by n + 2 units of rounding of what is subtracted, so that the covariance stays one.
+    """
+    second = np.asarray(second)
+    mean = second[:-1, -1]
+    rounding = (len(mean) + 2) * EPS * np.diag(np.diag(second)[:-1])
+    return mean, second[:-1, :-1] + rounding - np.outer(mean, mean)
+
+
+def split_homogeneous(
+    homogeneous: Float[np.ndarray, "m n"],
+) -> tuple[Float[np.ndarray, "m-1 n-1"], Float[np.ndarray, "m-1"]]:
+    """Return the matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
+    return homogeneous[:-1, :-1], homogeneous[:-1, -1]
+
+
+def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
+    """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
+    places = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
+    rows = np.zeros((variables if expected is None else expected, len(places) - 1))
+    for i, row in enumerate(rows):
+        row[places[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
+    return rows
+
+
+def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
+    """Return E[monomials of (x_0, 1)] of this order, under the plant's law of x_0."""
+    law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
+    shift = np.eye(len(plant.states) + 1)
+    shift[:-1, -1] = plant.initial_mean - law.mean
+    return np.asarray(push_through_known_map(shift, order, noise_moment_vector(law, order)))
+
+
+def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:
+    """Raise ValueError for a horizon or degree below 1 or a lifted system of more than MEMORY_LIMIT_ENTRIES numbers."""
+    check_horizon(horizon)
+    if check_count("degree of the lift", degree) > HIGHEST:
+        got = f"{degree}: binomials of twice the degree are no numbers of 64 bits"
+        raise fail("degree of the lift", f"at most {HIGHEST}", got)
+    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)
+    entries = horizon * (2 * (n * modes) ** 2 + n * modes * m + m * m)
+    of_modes = f" in {modes} modes" if modes > 1 else ""
+    if entries > MEMORY_LIMIT_ENTRIES:
+        got = (
+            f"{entries:,} ({n - 1} monomials of {states} states{of_modes} and {m - 1} of {outputs} outputs, "
+            f"{horizon} steps); "
+            "use a lower degree, a shorter horizon, or fewer states or outputs"
+        )
+        raise fail(f"lift of degree {degree}", f"at most {MEMORY_LIMIT_ENTRIES:,} entries", got)

@@ -1,0 +1,93 @@
+"""A linear model as maps of each step: from the state to the next one, and from it to what arrives."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import OverTime, first, list_steps, steps_covered
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.types import PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.law import Constant
+from heliograph.random_affine.moments.pushed_moments import TabulatedNoise
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.series_and_stack import Series
+from heliograph.random_affine.sum_of_maps import move_sensor_into_links
+
+T = TypeVar("T")
+
+
+class PlantAndMeasurementMaps(NamedTuple):
+    """One step of the model as two maps: the plant's, x -> x+, and from the state to what arrives, x+ -> z."""
+
+    plant: GainAndNoise
+    measurement: AbstractRandomAffine
+
+
+def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
+    """Raise ValueError unless plant and sensor are linear, without inputs, fit the channel, and have noise laws."""
+    first_plant = first(plant)
+    check_linear("polynomial filter", plant, sensor)
+    check_link(first(sensor), first(channel), len(first_plant.states))
+    if first_plant.inputs:
+        expected = "a plant without inputs (take the response to known inputs off the measurements first)"
+        raise fail("polynomial filter", expected, list(first_plant.inputs))
+    if not isinstance(first_plant.noise, AbstractNoise):
+        raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
+
+
+def make_plant_and_measurement_maps(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int
+) -> list[PlantAndMeasurementMaps]:
+    """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
+    plants = _convert_to_affine_maps(list_checked_steps(plant, horizon), order)
+    sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
+    if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
+        measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
+    else:
+        measurements = _make_measurement_maps(sensors, channels, order)
+    return [PlantAndMeasurementMaps(*pair) for pair in zip(plants, measurements, strict=True)]
+
+
+def _make_measurement_maps(
+    sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
+) -> list[AbstractRandomAffine]:
+    """Return the maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
+    apart = list[AbstractRandomAffine]()
+    for sensor, channel in zip(sensors, channels, strict=True):
+        assert isinstance(sensor, LinearSensor)  # checked before
+        by_link = move_sensor_into_links(sensor.matrix, sensor.noise, channel)
+        apart += [] if by_link is None else [by_link]
+    if len(apart) == len(sensors):
+        return apart
+    return [Series(pair) for pair in zip(_convert_to_affine_maps(sensors, order), channels, strict=True)]
+
+
+def _convert_to_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+    """Return the map x -> A x + noise of each plant or sensor, with the noise's moments tabulated up to `order`.
+
+    `check_model` has seen that all are linear. A model like the one before shares its map and table.
+    """
+    maps: list[GainAndNoise] = []
+    before, noise = None, TabulatedNoise(models[0].noise, order)
+    for model in models:
+        if model is before:
+            maps.append(maps[-1])
+            continue
+        if not eqx.tree_equal(model.noise, noise.source):
+            noise = TabulatedNoise(model.noise, order)
+        maps.append(GainAndNoise(Constant(1.0), model.matrix, noise))
+        before = model
+    return maps
+
+
+def list_checked_steps(model: T | OverTime, horizon: int) -> list[T]:
+    """Return a plant, sensor or channel at each of `horizon` steps."""
+    check_horizon(horizon)
+    check_horizon(horizon, steps_covered(model))
+    return list_steps(model, horizon)

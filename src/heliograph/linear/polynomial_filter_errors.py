@@ -1,0 +1,281 @@
+"""Polynomial filters before any data: the system behind the filter with memory, and gains over the linear filter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from heliograph.linear.lmmse_recursion import lmmse
+from heliograph.linear.monomial_lifted_system import (
+    initial_monomial_moments,
+    lifted_system,
+    make_linear_rows,
+    mean_and_spread,
+    refuse_lift,
+    split_homogeneous,
+)
+from heliograph.linear.plant_and_measurement_maps import check_model, make_plant_and_measurement_maps
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state_moments
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.hop import GainAndNoise, known
+from heliograph.random_affine.laws.law import Constant
+from heliograph.random_affine.moments.monomials import list_exponents, symmetric_power
+from heliograph.random_affine.moments.pushed_moments import (
+    TabulatedNoise,
+    products_of_monomials,
+    push_moments,
+    push_through_known_map,
+)
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+from heliograph.random_affine.series_and_stack import Series, Stack
+
+
+def quadratic_system_with_linear_estimate(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule
+) -> LinearSystem:
+    """Return the system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter.
+
+    Measured are z, z z' and z q' of the present step: components of the lifted state, so without noise of their own.
+
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel.
+        linear: schedule whose state is an estimate of all of x, as `lmmse` makes one from a system of degree 1.
+
+    Raises:
+        ValueError: a schedule of another shape, or what `lifted_system` refuses.
+    """
+    check_model(plant, sensor, channel)
+    plant_0, horizon = first(plant), linear.horizon
+    n, m = len(plant_0.states), int(first(channel).outputs)
+    if linear.gains.gain.shape[1:] != (n, m):
+        raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
+    total = 2 * n + m
+    refuse_lift(2, total, m + n, horizon)
+    # At the start (x_0, q_0, 0), q_0 a known number: an affine function of x_0. Moments up to order 4, of which
+    # `second` = E[Y Y'] of the products Y up to degree 2.
+    start_map = _affine_matrix(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
+    moments = push_through_known_map(start_map, 4, initial_monomial_moments(plant_0, 4))
+    second = products_of_monomials(moments, total + 1, 2)
+    mean, spread = mean_and_spread(second)
+    received, cache = _make_received_products(n, m), _MomentCache()
+    steps, rounding = list[Steps](), list[np.ndarray]()
+    for k, route in enumerate(make_plant_and_measurement_maps(plant, sensor, channel, 4, horizon)):
+        # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
+        move = cache.make_move_map(route.plant, m)
+        measure_squares, measure_fourth = cache.make_measurement_moments(route.measurement, n)
+        update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
+        # E[Y+ | Y] = M Y with M = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
+        transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
+        moments = push_through_known_map(update, 4, measure_fourth @ push_moments(move, 4, moments))
+        next_second = products_of_monomials(moments, total + 1, 2)
+        # Cov(w) = E[Y+ Y+'] - M E[Y Y'] M'.
+        process = next_second - transition @ second @ transition.T
+        matrix, drift = split_homogeneous(transition)
+        no_offset, no_noise = np.zeros(len(received)), np.zeros((len(received), len(received)))
+        steps.append(Steps(matrix, drift, process[:-1, :-1], received, no_offset, no_noise))
+        rounding.append(np.finfo(float).eps * np.diag(next_second)[:-1])
+        second = next_second
+    over_time = Steps(*map(np.array, zip(*steps, strict=True)))
+    system = LinearSystem(over_time, mean, spread, projection=make_linear_rows(total, 2, n), rounding=rounding)
+    return on_premise(system, Premise(plant, sensor, channel, order=4))
+
+
+def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
+    """Return [[A, a], [0, 1]] of x -> A x + a."""
+    return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
+
+
+def _make_filter_map(g: Gains) -> np.ndarray:
+    """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter."""
+    n, m = g.gain.shape
+    after = np.eye(2 * n + m)
+    after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
+    return _affine_matrix(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
+
+
+class _MomentCache:
+    """Moments of plant and link for the quadratic system, computed again only where the model changes."""
+
+    def __init__(self) -> None:
+        # The plant's noise of the last step, and that of (x+, q) made of it; the last measurement, and its moments.
+        self.noise: AbstractNoise | None = None
+        self.joint_noise: AbstractNoise | None = None
+        self.route: AbstractRandomAffine | None = None
+        self.moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
+        """Return the map (x, q, z) -> (x+, q) of a plant's step, q being n numbers and z m."""
+        n = plant.inputs
+        if self.joint_noise is None or plant.noise is not self.noise:
+            no_noise = Gaussian(np.zeros((n, n)))
+            self.noise, self.joint_noise = plant.noise, TabulatedNoise(Independent([plant.noise, no_noise]), 4)
+        matrix = np.zeros((2 * n, 2 * n + m))
+        matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
+        return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
+
+    def make_measurement_moments(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q)."""
+        if route is not self.route:
+            appended = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
+            self.route = route
+            self.moments = np.asarray(appended.moments(2).matrix), np.asarray(appended.moments(4).matrix)
+        return self.moments
+
+
+def _make_received_products(n: int, m: int) -> np.ndarray:
+    """Return the rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
+    total = 2 * n + m
+    places = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
+    expected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
+    for i in range(m):
+        for j in range(n):
+            expected.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
+    rows = np.zeros((len(expected), len(places) - 1))
+    for row, powers in zip(rows, expected, strict=True):
+        row[places[powers]] = 1.0
+    return rows
+
+
+SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
+
+
+@readable
+@dataclass(frozen=True)
+class GainOverLinear:
+    """Error covariances of filters by degree, exact before any data, and the skewness that higher degrees exploit.
+
+    Args:
+        states: names of the states.
+        covariance: error covariance over time (time, n, n) by degree.
+        skewness: the largest standardised joint third central moment of (x_k, z_k) over all steps.
+        after: first step that counts in `gain`, which leaves out the start.
+    """
+
+    states: tuple[str, ...]
+    covariance: dict[int, Float[np.ndarray, "time n n"]]
+    skewness: float
+    after: int
+
+    def gain(self, degree: int) -> Float[np.ndarray, "n"]:
+        """Return the share of the linear filter's error variance that this degree removes, for each state."""
+        mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
+        return np.asarray(1 - mean[degree] / mean[1])
+
+    @property
+    def symmetric(self) -> bool:
+        """True if all third moments vanish; then the quadratic filter is the linear one (a cubic one may still gain).
+
+        Third moments of (x_k, z_k) at one time are enough: x_j given x_i is affine in x_i plus independent noise, so
+        the third moments across times are made of them, and centred squares are uncorrelated with all x_k and z_k.
+        """
+        return self.skewness <= SYMMETRIC
+
+
+def gain_over_linear(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    horizon: int = 100,
+    degrees: Sequence[int] = (2, 3),
+    after: int | None = None,
+) -> GainOverLinear:
+    """Return the error covariances of the best filters of several degrees, to compare with the linear one's.
+
+    They follow from the model alone: no data are simulated.
+
+    Args:
+        plant: linear plant without inputs.
+        sensor: linear sensor.
+        channel: its channel.
+        horizon: number of steps, 100 unless given.
+        degrees: degrees to compare with 1, each at least 2; (2, 3) unless given.
+        after: first step that counts, a third of the horizon unless given.
+
+    Raises:
+        ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
+    """
+    check_count("horizon", horizon)
+    if not degrees or min(degrees) < 2:
+        raise fail("degrees", "at least one, all of 2 or more", list(degrees))
+    first_step = horizon // 3 if after is None else after
+    if not 0 <= first_step < horizon:
+        raise fail("first step that counts", f"one from 0 to {horizon - 1}", first_step)
+    # Degree 1 to compare with, and degree 2 for the skewness.
+    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in sorted({1, 2, *degrees})}
+    n, m = len(first(plant).states), int(first(channel).outputs)
+    covariances = {d: lmmse(system).gains.covariance for d, system in systems.items()}
+    return GainOverLinear(
+        states=first(plant).states, covariance=covariances, skewness=skewness(systems[2], n, m), after=first_step
+    )
+
+
+def skewness(square: LinearSystem, states: int, outputs: int) -> float:
+    """Return the largest |E (a - Ea)(b - Eb)(c - Ec)| / (sd a sd b sd c) over all steps k.
+
+    a and b are two components of x_k, or two of z_k, and c is any component of either.
+
+    Args:
+        square: the system of degree 2, whose state and measurement are the products of x_k and of z_k up to degree 2.
+        states: number of components of x.
+        outputs: number of components of z.
+    """
+    # The place of each product by the numbers of its factors: (i,) of x_i, (i, j) of x_i x_j.
+    x_places, z_places = _place_products(states), _place_products(outputs)
+    state = state_moments(square)
+    largest = 0.0
+    for k in range(square.horizon):
+        step, spread = square.step(k), state.covariance[k + 1]
+        cross = step.output @ spread
+        # Joint covariance and mean of (products of x, products of z), and the places of x and z themselves in it.
+        joint = np.block([[spread, cross.T], [cross, cross @ step.output.T + step.noise]])
+        mean = np.concatenate([state.mean[k + 1], step.output @ state.mean[k + 1] + step.offset])
+        first_z = len(spread)
+        linear = [x_places[(i,)] for i in range(states)] + [first_z + z_places[(i,)] for i in range(outputs)]
+        for places, start in ((x_places, 0), (z_places, first_z)):
+            # Places of the product a b, of a and of b.
+            pairs = [
+                (start + product, start + places[(factors[0],)], start + places[(factors[1],)])
+                for factors, product in places.items()
+                if len(factors) == 2
+            ]
+            largest = max([largest, *(_largest_third_moment(joint, mean, pair, linear) for pair in pairs)])
+    return largest
+
+
+def _largest_third_moment(
+    joint: Float[np.ndarray, "N N"], mean: Float[np.ndarray, "N"], pair: tuple[int, int, int], linear: list[int]
+) -> float:
+    """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
+
+    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c). `pair` are the places of a b, a and b, `linear` those of
+    each c.
+    """
+    product, a, b = pair
+    deviation = np.sqrt(np.diag(joint))
+    third = joint[product, linear] - mean[a] * joint[b, linear] - mean[b] * joint[a, linear]
+    size = deviation[a] * deviation[b] * deviation[linear]
+    ratio = np.divide(np.abs(third), size, out=np.zeros_like(third), where=size > 0)
+    return float(np.max(ratio))
+
+
+def _place_products(variables: int) -> dict[tuple[int, ...], int]:
+    """Return the positions of y_i and of y_i y_j among the monomials of degree 2."""
+    index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
+    unit = np.eye(variables + 1, dtype=int)
+    places: dict[tuple[int, ...], int] = {
+        (i,): index[tuple(int(v) for v in unit[i] + unit[-1])] for i in range(variables)
+    }
+    for i, j in combinations_with_replacement(range(variables), 2):
+        places[(i, j)] = index[tuple(int(v) for v in unit[i] + unit[j])]
+    return places

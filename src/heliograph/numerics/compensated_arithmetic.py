@@ -1,0 +1,323 @@
+"""Functions evaluated with what rounding takes from them: f(c + e) as a high part and a low one.
+
+Let fl(a . b) be an operation as it is rounded. Of a sum, a product, a quotient and a root the rounding error d is
+itself a number, or nearly, and is computed; of what was lost before, l, a derivative hands on f'(a) l. So the low part
+of each number is l+ = f'(a) l + d, the first-order correction of all roundings before it: what is left is of order
+eps^2, beside the roundings of functions that have no formula for d (a sine, a logarithm), which are eps of their own
+value. For a sum that is what matters: x + v cos(heading) dt far from the origin is rounded at |x| otherwise.
+
+Source: Langlois, Automatic linear correction of rounding errors (2001), with the derivatives forwards; Dekker, A
+floating-point technique for extending the available precision (1971), for the errors of sums and products.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+
+from heliograph.numerics.numpy_or_jax import called_program
+
+
+class Compensated(NamedTuple):
+    """A number as high + low, of one shape; `low` is None where nothing was lost."""
+
+    high: Any
+    low: Any = None
+
+
+def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
+    """Return fl(a + b) and its rounding error, whichever is larger.
+
+    Source: Knuth, The art of computer programming, volume 2, theorem B of section 4.2.2.
+    """
+    total = a + b
+    back = total - a
+    return Compensated(total, (a - (total - back)) + (b - back))
+
+
+def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Callable[[Compensated], Compensated]:
+    """Return x -> f(high + low), compensated, of a JAX function f of one array.
+
+    Loops hand on what was lost before them, and their own roundings stay. Where a low part is no number,
+    as behind the derivative of a root at 0, there is none.
+
+    Args:
+        function: f, of operations with derivatives.
+        unit: eps of the precision in which it will be computed; constants are divided in it too.
+    """
+
+    def evaluate(x: Compensated) -> Compensated:
+        """Return f(high + low) as high + low, 0 where the low part is no number."""
+        program = jax.make_jaxpr(function)(x.high)
+        result = _CompensatedEvaluation(unit).evaluate_program(program, [x])[0]
+        low = jnp.zeros_like(result.high) if result.low is None else result.low
+        return Compensated(jnp.asarray(result.high), jnp.where(jnp.isfinite(low), low, 0.0))
+
+    return evaluate
+
+
+class _CompensatedEvaluation:
+    """Evaluation of a traced program in numbers that are high + low."""
+
+    def __init__(self, unit: float):
+        bits = 1 - round(np.log2(unit))  # of a number's fraction: 24 of single precision, 53 of double
+        self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # times which a number is split into halves of its digits
+        self.stored = np.float32 if bits <= 24 else np.float64
+        self.rules: dict[str, Callable[..., Compensated]] = {
+            "add": self._add, "add_any": self._add, "sub": self._subtract, "mul": self._multiply, "div": self._divide,
+            "sqrt": self._take_root, "square": self._square, "integer_pow": self._raise_to_integer,
+            "reduce_sum": self._sum, "cumsum": self._sum_running, "dot_general": self._multiply_matrices,
+        }  # fmt: skip
+
+    def evaluate_program(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
+        """Return the results of a traced program."""
+        jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
+        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
+        values |= zip(jaxpr.invars, inputs, strict=True)
+
+        def look_up(v: Any) -> Compensated:
+            """Return the value of a variable or of a number in the program."""
+            return self._split_known(v.val) if isinstance(v, Literal) else values[v]
+
+        for equation in jaxpr.eqns:
+            results = self._apply_operation(equation, list(map(look_up, equation.invars)))
+            values |= zip(equation.outvars, results, strict=True)
+        return list(map(look_up, jaxpr.outvars))
+
+    def _split_known(self, number: Any) -> Compensated:
+        """Split a known real number into what the precision holds of it and the rest."""
+        if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
+            return Compensated(number)
+        whole = np.asarray(number, np.float64)
+        high = whole.astype(self.stored).astype(np.float64)
+        rest = np.subtract(whole, high, out=np.zeros_like(whole), where=np.isfinite(high))
+        return Compensated(high, rest if np.any(rest) else None)
+
+    def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
+        """Return the results of one operation; of one without a rule f(high) + f'(high) rest."""
+        name, params = equation.primitive.name, equation.params
+        if (program := called_program(equation)) is not None:
+            return self.evaluate_program(program, inputs)
+        if name == "cond":
+            return self._apply_branches(inputs, params["branches"])
+        if name in self.rules and all(jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in inputs):
+            return [self.rules[name](*inputs, **params)]
+        return _apply_to_first_order(partial(_apply_unchanged, equation), inputs, equation.primitive.multiple_results)
+
+    def _apply_branches(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
+        """Take one of several programs, each evaluated so."""
+
+        def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
+            """Return its results, each with a low part if it is a real number, as those of the others."""
+            results = self.evaluate_program(branch, given)
+            real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
+            return [
+                Compensated(jnp.asarray(x.high), _or_zero(x.low) + jnp.zeros_like(x.high)) if is_real else x
+                for x, is_real in zip(results, real, strict=True)
+            ]
+
+        index = jnp.asarray(inputs[0].high, np.int32)
+        results: list[Compensated] = lax.switch(
+            index, [partial(evaluate_branch, branch) for branch in branches], inputs[1:]
+        )
+        return results
+
+    def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Add two numbers, with what the sum's rounding and theirs lost."""
+        total, error = split_sum(a.high, b.high)
+        return Compensated(total, _sum_terms_present(error, a.low, b.low))
+
+    def _subtract(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Subtract: add the negative."""
+        return self._add(a, Compensated(-b.high, None if b.low is None else -b.low))
+
+    def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Multiply two numbers, with what the product's rounding and theirs lost."""
+        lost = [x.low * y.high for x, y in ((a, b), (b, a)) if x.low is not None]
+        return Compensated(a.high * b.high, _sum_terms_present(self._find_product_error(a.high, b.high), *lost))
+
+    def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
+        """Divide: the remainder a - q b, and what was lost of it, over b."""
+        quotient = a.high / b.high
+        back = quotient * b.high
+        lost = None if b.low is None else -quotient * b.low
+        rest = _sum_terms_present((a.high - back) - _or_zero(self._find_product_error(quotient, b.high)), a.low, lost)
+        return Compensated(quotient, rest / b.high)
+
+    def _take_root(self, a: Compensated, **_: Any) -> Compensated:
+        """Take a root: the remainder a - r^2, and what was lost of a, over 2 r."""
+        root = jnp.sqrt(a.high)
+        rest = _sum_terms_present((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
+        return Compensated(root, rest / (2 * root))
+
+    def _square(self, a: Compensated, **_: Any) -> Compensated:
+        """Multiply a number by itself."""
+        return self._multiply(a, a)
+
+    def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
+        """Return a^y as y products; its reciprocal for y < 0, 1 for y = 0."""
+        if y < 1:
+            return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y)) if y else _one_like(a)
+        return reduce(self._multiply, [a] * y)
+
+    def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
+        """Add the entries along axes, one after another."""
+        for axis in sorted(axes, reverse=True):
+            parts = _split_along_axis(a, axis)
+            a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
+        return a
+
+    def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
+        """Return the running sums along an axis, from its first entry on or from its last."""
+        parts = _split_along_axis(a, axis)
+        if reverse:
+            for i in reversed(range(len(parts) - 1)):
+                parts[i] = self._add(parts[i + 1], parts[i])
+        else:
+            for i in range(1, len(parts)):
+                parts[i] = self._add(parts[i - 1], parts[i])
+        highs, lows = [p.high for p in parts], [_or_zero(p.low) + jnp.zeros_like(p.high) for p in parts]
+        return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
+
+    def _multiply_matrices(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
+        """Multiply matrices by the products of entries, added one after another."""
+        # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
+        (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+        left = _arrange_factor(a, batch_a, summed_a, left=True)
+        right = _arrange_factor(b, batch_b, summed_b, left=False)
+        shape_a, shape_b = jnp.shape(a.high), jnp.shape(b.high)
+        shape = [shape_a[axis] for axis in batch_a]
+        shape += [n for axis, n in enumerate(shape_a) if axis not in (*batch_a, *summed_a)]
+        shape += [n for axis, n in enumerate(shape_b) if axis not in (*batch_b, *summed_b)]
+        products = [
+            self._multiply(x, y) for x, y in zip(_split_along_axis(left, 1), _split_along_axis(right, 1), strict=True)
+        ]
+        if not products:
+            return Compensated(jnp.zeros(shape))
+        total = reduce(self._add, products)
+        return Compensated(*(None if part is None else jnp.reshape(part, shape) for part in total))
+
+    def _find_product_error(self, a: Any, b: Any) -> Any:
+        """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
+        if _scales_without_rounding(a) or _scales_without_rounding(b):
+            return None
+        (a1, a2), (b1, b2) = self._split_digits_in_halves(a), self._split_digits_in_halves(b)
+        return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
+
+    def _split_digits_in_halves(self, a: Any) -> tuple[Any, Any]:
+        """Return a as a sum of two numbers of half as many digits.
+
+        Source: Dekker, A floating-point technique for extending the available precision (1971).
+        """
+        if not isinstance(a, jax.Array):
+            whole: Any = np.asarray(a, self.stored)
+            far = whole * self.stored(self.splitter)
+            high = far - (far - whole)
+            return high.astype(np.float64), (whole - high).astype(np.float64)
+        far = a * self.splitter
+        high = far - (far - a)
+        return high, a - high
+
+
+def _apply_unchanged(equation: JaxprEqn, *arguments: Any) -> Any:
+    """Apply an operation as it is."""
+    primitive: Any = equation.primitive
+    return primitive.bind(*arguments, **equation.params)
+
+
+def _apply_to_first_order(
+    function: Callable[..., Any], inputs: Sequence[Compensated], several: bool
+) -> list[Compensated]:
+    """Return f of numbers in two parts, as numbers in two parts: f(high), and f'(high) low, to first order.
+
+    A number is high + low, its rounded value and what rounding lost of it; low is None where nothing was lost.
+
+    Args:
+        function: f, of the high parts.
+        inputs: its arguments.
+        several: whether f returns a list of results rather than one.
+    """
+    with_low = [i for i, x in enumerate(inputs) if x.low is not None]
+
+    def call_with(*replaced: Any) -> Any:
+        """Return f with these values in the places of the inputs that have a low part."""
+        arguments = [x.high for x in inputs]
+        for i, value in zip(with_low, replaced, strict=True):
+            arguments[i] = value
+        return function(*arguments)
+
+    lows: Any = None  # the results' low parts; None where no input has one
+    if not with_low:
+        results = call_with()
+    else:
+        highs = [jnp.asarray(inputs[i].high) for i in with_low]
+        directions = [jnp.broadcast_to(inputs[i].low, x.shape) for i, x in zip(with_low, highs, strict=True)]
+        results, lows = jax.jvp(call_with, highs, directions)
+    if not several:
+        results, lows = [results], None if lows is None else [lows]
+    if lows is None:
+        return [Compensated(x, None) for x in results]
+    # Whole numbers have no derivative.
+    return [
+        Compensated(x, low if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None)
+        for x, low in zip(results, lows, strict=True)
+    ]
+
+
+def _scales_without_rounding(a: Any) -> bool:
+    """Return whether a known number multiplies without rounding: each entry is 0 or a power of two."""
+    if isinstance(a, jax.Array | jax.core.Tracer):
+        return False
+    return bool(np.all((np.abs(np.frexp(a)[0]) == 0.5) | (np.asarray(a) == 0)))
+
+
+def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
+    """Return the entries along an axis."""
+    count = jnp.shape(a.high)[axis]
+    parts = [[None] * count if x is None else [_take(x, i, axis) for i in range(count)] for x in a]
+    return [Compensated(high, low) for high, low in zip(*parts, strict=True)]
+
+
+def _take(x: Any, i: int, axis: int) -> Any:
+    """Return entry i along an axis; of a known array a known one."""
+    return lax.index_in_dim(x, i, axis, False) if isinstance(x, jax.Array) else np.take(x, i, axis)
+
+
+def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int], left: bool) -> Compensated:
+    """Arrange the left factor as (batch, summed, rows, 1), or the right one as (batch, summed, 1, columns).
+
+    `batch` and `summed` are its axes of these kinds; of each kind the axes become one.
+    """
+    shape = jnp.shape(a.high)
+    rest = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
+    sizes = [int(np.prod([shape[axis] for axis in axes], dtype=int)) for axes in (batch, summed, rest)]
+    sizes = [*sizes, 1] if left else [*sizes[:2], 1, sizes[2]]
+    order = [*batch, *summed, *rest]
+    parts = [None if x is None else x.transpose(order).reshape(sizes) for x in map(_as_array, a)]
+    return Compensated(*parts)
+
+
+def _as_array(x: Any) -> Any:
+    """Return a part of a number as an array; None and JAX's arrays as they are."""
+    return x if x is None or isinstance(x, jax.Array) else np.asarray(x)
+
+
+def _sum_terms_present(*terms: Any) -> Any:
+    """Return the sum of those terms that are not None."""
+    given = [x for x in terms if x is not None]
+    return reduce(lambda a, b: a + b, given) if given else None
+
+
+def _or_zero(x: Any) -> Any:
+    """Return a low part, 0 where nothing was lost."""
+    return 0.0 if x is None else x
+
+
+def _one_like(a: Compensated) -> Compensated:
+    """Return ones of a number's shape."""
+    return Compensated(jnp.ones_like(a.high))

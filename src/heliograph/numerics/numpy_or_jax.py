@@ -1,0 +1,192 @@
+"""Arithmetic written once for known numbers (NumPy float64) and for numbers that JAX traces.
+
+A model's moments are plain numbers in ordinary use, and functions of traced parameters under `jax.grad`, `jax.jvp` or
+`jax.jit`. What is decided by a number's value (is it zero, is it certain) is decided for known numbers only.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import jax.scipy.special
+import numpy as np
+import scipy
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
+
+
+def is_traced(*values: object) -> bool:
+    """Return whether some number in these arrays or lists of numbers is traced."""
+    return any(
+        isinstance(leaf, jax.core.Tracer)
+        for value in values
+        if not isinstance(value, np.ndarray | float | int)  # asked of each number of a model: known at a look
+        and not isinstance(value, Iterator)  # which is no tree of numbers to JAX
+        for leaf in jax.tree.leaves(value)
+    )
+
+
+DOUBLE = "with np.asarray, or after jax.config.update('jax_enable_x64', True)"
+MEANT_BITS = 12  # of a number of fewer, such as 2^-30, all are meant, whatever its shortest decimal is
+
+
+def find_rounded_to_single(value: object) -> tuple[float, float] | None:
+    """Return the first number of an array that was rounded to single precision, as it was meant and as it is.
+
+    Known by its value, in double precision too: it is a number of single precision of many bits, and the shortest
+    decimal that single precision takes for it, which a user will have written, is another double. None if none is.
+    """
+    numbers: np.ndarray = np.asarray(value)
+    if numbers.dtype.kind != "f":
+        return None
+    finite = numbers[np.isfinite(numbers)].astype(float)
+    with np.errstate(over="ignore", under="ignore"):
+        single = finite.astype(np.float32)
+    meant = single.astype(str).astype(float)  # by way of the shortest decimal
+    # A number has more than MEANT_BITS bits if its mantissa, times 2 to that power, is no whole number.
+    scaled_mantissa = np.frexp(finite)[0] * 2.0**MEANT_BITS
+    has_many_bits = scaled_mantissa != np.floor(scaled_mantissa)
+    (rounded,) = np.nonzero((single == finite) & (meant != finite) & has_many_bits)
+    return (float(meant[rounded[0]]), float(finite[rounded[0]])) if len(rounded) else None
+
+
+def warn_of_single(name: str, value: object) -> None:
+    """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1."""
+    if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
+        return
+    rounded = find_rounded_to_single(value)
+    if rounded is not None:
+        got = f"a JAX array of single precision of shape {np.asarray(value).shape}"
+        _warn_once(f"{name}: expected double precision, got {got}, {describe_rounded(rounded)}; make it {DOUBLE}")
+
+
+def describe_rounded(rounded: tuple[float, float]) -> str:
+    """Return in words which number was meant, and which it is."""
+    return f"{rounded[0]:g} is {rounded[1]:.10g}"
+
+
+@cache
+def _warn_once(text: str) -> None:
+    """Warn once in a process, at the line that called the check of a user's array."""
+    warnings.warn(text, stacklevel=4)
+
+
+def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
+    """Trace a function in double precision; return the arrays that it holds, and the shape of its result."""
+    with jax.enable_x64(True):
+        made = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
+    shape: tuple[int, ...] = made.out_avals[0].shape
+    return list(made.consts), shape
+
+
+def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
+    """Return the shape of a function's result, traced in double precision; warn of arrays in it that have less."""
+    held, shape = constants(function, *arguments)
+    for constant in held:
+        if isinstance(constant, jax.Array):
+            warn_of_single(name, constant)
+    return shape
+
+
+def as_real(value: object) -> jax.Array:
+    """Return what a user's function returned as an array of real numbers: whole numbers and flags as floats.
+
+    Raises:
+        TypeError: complex numbers.
+    """
+    numbers = jnp.asarray(value)
+    if jnp.issubdtype(numbers.dtype, jnp.complexfloating):
+        raise TypeError("complex numbers, where real ones are expected")
+    return numbers if jnp.issubdtype(numbers.dtype, jnp.floating) else numbers.astype(float)
+
+
+def library(*values: object) -> Any:
+    """Return numpy for known numbers, jax.numpy where one is traced."""
+    return jnp if is_traced(*values) else np
+
+
+def scipy_for(*values: object) -> Any:
+    """Return scipy, or jax.scipy where a number is traced."""
+    return jax.scipy if is_traced(*values) else scipy
+
+
+CALLS = frozenset((
+    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "checkpoint", "remat", "remat2",
+))  # fmt: skip
+
+
+def called_program(operation: JaxprEqn) -> ClosedJaxpr | None:
+    """Return the program that an operation of a traced function calls on its operands; None if it calls none.
+
+    A jitted function within another is such a call, and one with a derivative of its own.
+    """
+    if operation.primitive.name not in CALLS:
+        return None
+    params = operation.params
+    program = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+    return ClosedJaxpr(program, ()) if isinstance(program, Jaxpr) else program
+
+
+def plain(value: Any) -> float | jax.Array:
+    """Return a known number as a Python float, a traced one unchanged."""
+    number: float | jax.Array = value if is_traced(value) else float(value)
+    return number
+
+
+def stack_parts(parts: Sequence[object]) -> jax.Array | np.ndarray:
+    """Stack numbers or arrays of one shape along a new first axis."""
+    array: jax.Array | np.ndarray = library(parts).stack(parts)
+    return array
+
+
+def block_diagonal(blocks: Sequence[Any]) -> Any:
+    """Put matrices along the diagonal of a larger one, whose other entries are 0.
+
+    SciPy's own brings its whole library of linear algebra: a sixth of a second of a program's start.
+    """
+    if is_traced(blocks):
+        return jax.scipy.linalg.block_diag(*blocks)
+    rows, columns = (np.cumsum([0, *(block.shape[axis] for block in blocks)]) for axis in (0, 1))
+    whole = np.zeros((rows[-1], columns[-1]))
+    for block, top, left in zip(blocks, rows, columns, strict=False):
+        whole[top : top + block.shape[0], left : left + block.shape[1]] = block
+    return whole
+
+
+def is_zero(value: Any) -> bool:
+    """Return whether a number is known to be zero."""
+    return not is_traced(value) and not np.any(value)
+
+
+def scatter(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
+    """Return an array of zeros of shape `size` with `values` added at `places` (an index of its leading axes).
+
+    Values at repeated places add up.
+    """
+    if is_traced(values):
+        return jnp.zeros(size).at[places].add(values)
+    table = np.zeros(size)
+    np.add.at(table, places, values)
+    return table
+
+
+EQUAL = 1e-12  # relative: numbers that were computed in another order
+
+
+def equal_to_rounding(a: Any, b: Any) -> bool:
+    """Test whether all entries are equal to rounding; a traced one is equal to itself alone."""
+    if is_traced(a, b) or np.shape(a) != np.shape(b):
+        return a is b
+    x, y = np.asarray(a), np.asarray(b)
+    return bool(np.all(np.abs(x - y) <= EQUAL * np.maximum(np.abs(x), np.abs(y))))
+
+
+def within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
+    """Test whether probabilities with their room are all within a radius of the believed ones."""
+    if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
+        return False
+    return bool(np.all(np.abs(own - believed) + room <= np.asarray(radius) + EQUAL))

@@ -1,0 +1,336 @@
+"""Memories of links: a Markov chain of modes, or a Gaussian fading that drifts; neither depends on what is sent.
+
+A memory has a state that moves from step to step. Given its state a link forgets: gain and noise are drawn anew.
+"""
+
+from collections.abc import Iterable
+from copy import copy
+from math import comb, factorial
+from typing import NamedTuple
+from uuid import uuid4
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.polynomial.hermite_e import hermegauss, hermevander
+
+from heliograph.numerics.caching import cache_arrays
+from heliograph.numerics.check import (
+    PROBABILITY,
+    PROBABILITY_TOLERANCE,
+    SIMPLEX,
+    array,
+    check_count,
+    fail,
+    probabilities,
+    radii,
+    report_domain,
+    scalar,
+)
+from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.numpy_or_jax import equal_to_rounding, is_traced, library, within
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.laws.law import draw_index
+
+Rows = Float[jax.Array | np.ndarray, "modes modes"]
+Law = Float[jax.Array | np.ndarray, " modes"]
+
+
+class MemoryStates(NamedTuple):
+    """Finitely many states of a memory: their law at the first use, and row by row that of the next given the present.
+
+    The rows sum to 1. Their entries are probabilities for a chain; for a drifting fading they reproduce all
+    expectations of polynomials up to a degree, and may be negative.
+    """
+
+    states: jax.Array | np.ndarray
+    initial: Law
+    transition: Rows
+    radius: Rows | float = 0.0
+
+
+@readable
+class AbstractMemory(Module):
+    """Memory of a link: a state that moves from step to step, on which the law of gain and noise depends.
+
+    Links share a memory by its `name`, which also seeds its draws (shared fading, `hg.shared`). One without a name is
+    of one link: where an object stands at several nodes or hops, each has its own. Within one map the maps that refer
+    to one object are in one state.
+    """
+
+    name: eqx.AbstractVar[str | None]
+    identity: eqx.AbstractVar[str]
+
+    @property
+    def drifts(self) -> bool:
+        """True if the state is a number that drifts, False if it is one of finitely many modes."""
+        return False
+
+    @property
+    def is_uncertain(self) -> bool:
+        """True if its law is known only within a radius."""
+        return False
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw the initial state."""
+        raise unwritten(self, "begin")
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """Draw the next state."""
+        raise unwritten(self, "move")
+
+    def nodes(self, degree: int) -> MemoryStates:
+        """Return the memory as finitely many states, exact for a mean that is a polynomial of `degree` in the state."""
+        raise unwritten(self, "nodes")
+
+    @property
+    def announced(self) -> int:
+        """How many numbers a receiver that is told of the state gets; one unless said otherwise."""
+        return 1
+
+    def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+        """Return the numbers that a receiver gets which is told of the state (announced,): by default the state."""
+        numbers: jax.Array | np.ndarray = library(state).stack([state])
+        return numbers
+
+    def state_from_number(self, number: jax.Array) -> jax.Array:
+        """Return the state that a received number stands for."""
+        raise unwritten(self, "state_from_number")
+
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """Return the points and weights for the next state's law given this one (None: for the law at the first use).
+
+        Exact for polynomials of twice the `degree` in the state.
+        """
+        raise unwritten(self, "next_state_quadrature")
+
+    def labelled(self, label: str) -> "AbstractMemory":
+        """Return a copy that no link refers to yet, identified by `label` alone."""
+        twin = copy(self)  # a construction would check numbers that may be stacked over time
+        object.__setattr__(twin, "name", None)
+        object.__setattr__(twin, "identity", label)
+        return twin
+
+    def named(self, name: str) -> "AbstractMemory":
+        """Return a copy with this name, one memory with all others of the name."""
+        twin = self.labelled(identify_memory(name))
+        object.__setattr__(twin, "name", name)
+        return twin
+
+
+class MarkovChain(AbstractMemory):
+    """Markov chain of modes 0, 1, ...: transition[i, j] = P(next mode j | present mode i).
+
+    Args:
+        transition: probabilities (modes, modes), each row a law. Where it varies in time (channels in `over_time`),
+            that of
+            step k leads from step k to step k + 1.
+        initial: law (modes,) of the mode at the first use; the stationary law unless given.
+        name: name by which copies and nodes of a network share the chain; None for a chain of its own.
+        radius: how far each probability may be off, differently at each step; one number or (modes, modes), 0 unless
+            given.
+
+    Raises:
+        ValueError: rows that are no probabilities; no initial law, and more than one stationary law.
+    """
+
+    transition: Rows
+    initial: Law
+    radius: np.ndarray
+    name: str | None = eqx.field(static=True)
+    identity: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        transition: "Float[ArrayLike, 'modes modes']",
+        initial: "Float[ArrayLike, ' modes'] | None" = None,
+        name: str | None = None,
+        radius: "Float[ArrayLike, '*modes']" = 0.0,
+    ):
+        report_domain("transition matrix", transition, SIMPLEX, PROBABILITY)
+        self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
+        if rows.shape[0] != rows.shape[1] or not rows.size:
+            raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")
+        for i, row in enumerate(rows):
+            probabilities(f"transition from mode {i}", row)
+        self.radius = radii("radius of the transition", radius, rows)
+        self.initial = (
+            find_stationary_law(rows) if initial is None else probabilities("initial law", initial, len(rows))
+        )
+        self.name, self.identity = name, identify_memory(name)
+
+    @property
+    def is_uncertain(self) -> bool:
+        """True if some transition has a radius."""
+        return bool(np.any(self.radius > 0))
+
+    def covers(self, own: "MarkovChain") -> bool:
+        """Decide whether another chain is this memory, its transition within the radius."""
+        if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
+            return False
+        return within(own.transition, own.radius, self.transition, self.radius)
+
+    @property
+    def modes(self) -> int:
+        """Number of modes."""
+        return int(self.transition.shape[-1])
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw the mode at the first use."""
+        return draw_index(self.initial, key)
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """Draw the next mode."""
+        return draw_index(jnp.asarray(self.transition)[state], key)
+
+    def nodes(self, degree: int) -> MemoryStates:
+        """Return the modes, with the chain's initial law and transition: exact whatever the degree."""
+        return MemoryStates(np.arange(self.modes), self.initial, self.transition, self.radius)
+
+    def state_from_number(self, number: jax.Array) -> jax.Array:
+        """Return the nearest mode from below."""
+        return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
+
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """Return the modes with their probabilities."""
+        law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
+        return jnp.arange(self.modes), law
+
+
+class CertainChain(MarkovChain):
+    """A chain whose transitions are certain, also where all numbers are traced.
+
+    Raises:
+        ValueError: a chain whose transitions may be off.
+    """
+
+    def __init__(self, chain: MarkovChain):
+        """Take over a chain, whose radius is that of certain transitions, 0."""
+        if chain.is_uncertain:
+            raise fail("transitions of a chain", "known ones, beside what a message tells", "uncertain ones")
+        self.transition, self.initial, self.radius = chain.transition, chain.initial, chain.radius
+        self.name, self.identity = chain.name, chain.identity
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Always False."""
+        return False
+
+
+class Autoregression(AbstractMemory):
+    """Gaussian memory with mean 0 and variance 1 that drifts, c+ = rho c + sqrt(1 - rho^2) e, always stationary.
+
+    Args:
+        correlation: rho between one step and the next, from -1 to 1.
+        name: name by which copies and nodes of a network share the memory; None for one of its own.
+
+    Raises:
+        ValueError: a correlation outside [-1, 1].
+    """
+
+    correlation: Float[jax.Array | np.ndarray, ""]
+    name: str | None = eqx.field(static=True)
+    identity: str = eqx.field(static=True)
+
+    def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
+        self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
+        self.name, self.identity = name, identify_memory(name)
+
+    @property
+    def drifts(self) -> bool:
+        """Always True."""
+        return True
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw N(0, 1)."""
+        return jax.random.normal(key, dtype=float)
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """Return rho c + sqrt(1 - rho^2) e."""
+        rho = jnp.asarray(self.correlation)
+        return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
+
+    def nodes(self, degree: int) -> MemoryStates:
+        """Return Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
+
+        With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
+        the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
+        this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
+        """
+        x, w, hermite = _hermite_quadrature(check_count("degree", degree, 0) + 1)
+        powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
+        return MemoryStates(x, w, (hermite * powers) @ hermite.T * w)
+
+    def state_from_number(self, number: jax.Array) -> jax.Array:
+        """Return the number itself: the state is a real number."""
+        return number
+
+    def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """Return rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
+        x, w, _ = _hermite_quadrature(degree + 1)
+        rho = jnp.asarray(self.correlation)
+        return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
+
+    def chain(self, modes: int) -> MemoryStates:
+        """Return a chain with the same mean, variance and correlation, without negative entries.
+
+        Its states are binomial nodes, and E[c+ | c] = rho c.
+
+        Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
+        """
+        n = check_count("modes of a fading", modes, 2) - 1
+        xp = library(self.correlation)
+        stays = (1 + xp.asarray(self.correlation)) / 2
+        rows = [
+            xp.convolve(_compute_binomial_probabilities(i, stays), _compute_binomial_probabilities(n - i, 1 - stays))
+            for i in range(n + 1)
+        ]
+        return MemoryStates(
+            np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows)
+        )
+
+
+def find_stationary_law(transition: Rows) -> Law:
+    """Return the law p = p Pi of a chain that has only one; ValueError of one that has several."""
+    m = len(transition)
+    xp = library(transition)
+    if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
+        raise fail("initial law", "one, since the chain has several stationary laws", "none")
+    balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
+    law = xp.linalg.solve(balance, np.eye(m)[-1])
+    normalised: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
+    return normalised
+
+
+def identify_memory(name: str | None) -> str:
+    """Return a text that identifies a memory, through copies and in other processes; no draw depends on it."""
+    if name is not None and (not isinstance(name, str) or not name):
+        raise fail("name of a memory", "a text", repr(name))
+    return uuid4().hex if name is None else f"named {name}"
+
+
+def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+    """Return the probabilities of 0, ..., n successes."""
+    k = np.arange(n + 1)
+    ways = np.array([comb(n, i) for i in k], dtype=float)
+    binomial: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
+    return binomial
+
+
+@cache_arrays
+def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
+    x, w = hermegauss(count)
+    scale = np.sqrt([float(factorial(m)) for m in range(count)])
+    return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale
+
+
+def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
+    """Return the memories without repetition, told apart by their labels, in order of appearance."""
+    results: dict[str, AbstractMemory] = {}
+    for memory in held:
+        known = results.setdefault(memory.identity, memory)
+        if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
+            raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
+    return results

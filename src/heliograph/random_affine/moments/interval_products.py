@@ -1,0 +1,35 @@
+"""Products of matrices and of polynomials whose entries lie between a lowest and a highest value."""
+
+import jax
+import numpy as np
+
+from heliograph.numerics.numpy_or_jax import library, scatter, stack_parts
+from heliograph.numerics.types import Float
+from heliograph.random_affine.moments.monomials import count_monomials, product_table
+
+CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
+
+Entries = Float[jax.Array | np.ndarray, "..."]
+Interval = tuple[Entries, Entries]
+
+
+def multiply_matrices(second: Interval, first: Interval) -> Interval:
+    """Return the interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
+    c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
+    c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
+    size = library(c1, c2).abs
+    center, radius = c2 @ c1, size(c2) @ r1 + r2 @ (size(c1) + r1)
+    return center - radius, center + radius
+
+
+def multiply_interval_polynomials(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
+    """Return the interval product of two polynomials: ends of the products of ends, summed over equal monomials.
+
+    Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
+    """
+    table = product_table(variables, first, second)
+    size = (count_monomials(variables, first + second),)
+    products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
+    return stack_parts(
+        [scatter(size, table, products.min(axis=(0, 1))), scatter(size, table, products.max(axis=(0, 1)))]
+    )

@@ -1,0 +1,82 @@
+"""Maps from second moments to matrices that dominate what a channel makes of them, and their sums and sizes."""
+
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.linalg import contract
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import is_traced, library
+from heliograph.random_affine.moments.moment_tensors import Matrix, Tensor, drop_constant
+
+
+class QuadraticMap(Module):
+    """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
+
+    Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
+    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin,
+    in units d of each component's own, d_i^2 = |C_ii:W| + R_ii:|W|).
+
+    Shapes: center, radius (m, m, p + 1, p + 1).
+    """
+
+    center: Tensor
+    radius: Tensor
+
+    def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
+        mask = present[:, None] & present[None, :]
+        center = self.evaluate_center(second_moment, present)
+        entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
+        unit = jnp.sqrt(_one_unless_positive(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
+        return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
+
+    def evaluate_center(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """Return C:W alone, which is all where the law is known."""
+        return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
+
+
+def _one_unless_positive(value: jax.Array) -> jax.Array:
+    """Return positive numbers as they are, and 1 in place of others: a divisor."""
+    return jnp.where(value > 0, value, 1.0)
+
+
+def map_of_known_law(tensor: Tensor) -> QuadraticMap:
+    """Return the map W -> T:W of a law that is known, without an uncertain part."""
+    return QuadraticMap(tensor, np.zeros(tensor.shape))
+
+
+def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
+    """Return what the map makes of y alone, without the constant 1."""
+    return QuadraticMap(drop_constant(bound.center), drop_constant(bound.radius))
+
+
+def size_of_map(shift: QuadraticMap) -> Any:
+    """Return the root of the power that the map gives of unit signals; it weighs bounds, and has no derivative."""
+    tensor = stop_gradient(shift.center + shift.radius)
+    return library(tensor).sqrt(library(tensor).einsum("iiaa->", tensor))
+
+
+def add_maps(*maps: QuadraticMap) -> QuadraticMap:
+    """Return the sum of maps of second moments."""
+    return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
+
+
+def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
+    """Return a map of second moments times a number."""
+    return QuadraticMap(factor * part.center, factor * part.radius)
+
+
+def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
+    """Return the map of outputs start, start + 1, ... among all of them, zero elsewhere."""
+    margin = (start, outputs - start - block.center.shape[0])
+    widths = [margin, margin, (0, 0), (0, 0)]
+    return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
+
+
+def stop_gradient(value: Matrix) -> Matrix:
+    """Stop the gradient of a number on which a decision depends."""
+    return jax.lax.stop_gradient(value) if is_traced(value) else value

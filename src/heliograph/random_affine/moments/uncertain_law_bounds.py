@@ -1,0 +1,120 @@
+"""Bounds of a channel's second moments where probabilities are known up to a radius: over corner laws, by intervals."""
+
+import jax
+import numpy as np
+
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.moment_tensors import (
+    Matrix,
+    Tensor,
+    drop_constant,
+    symmetric_product,
+)
+from heliograph.random_affine.moments.monomials import JointMoments
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap, stop_gradient
+
+PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
+
+
+def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the spread about the nominal mean H0, shift of the mean, and power, all of one law."""
+    raw = moments.second
+    law_mean = moments.mean[:-1]
+    spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
+    return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
+
+
+def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
+    """Return one map above all of the (law, m, m, p + 1, p + 1) tensors, such as the spreads under corner laws v.
+
+    Where y enters as s_v M y y' M' under every law, and one noise matrix is above all others, the map of the largest
+    s_v and that noise; else the middle of the range of each entry, with half the range as radius.
+    """
+    xp = library(tensors)
+    low, high = tensors.min(axis=0), tensors.max(axis=0)
+    exact, holds = _find_dominating_tensor(tensors, mean)
+    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
+
+
+def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+    """Return the tensor max_v s_v M y y' M' + N_max, and whether it dominates the tensors of all laws v.
+
+    N_max is the largest noise. It dominates if the gain's part of the tensor of law v is s_v M y y' M', to rounding,
+    gain and noise are uncorrelated, and N_max - N_v >= 0.
+
+    Args:
+        tensors: (law, m, m, p + 1, p + 1), maps of (y, 1) (y, 1)' to a second moment of z.
+        mean: (M, mean offset) (m, p + 1).
+    """
+    xp = library(tensors, mean)
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M' (m, m, p, p)
+    gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
+    mean_size: Matrix = xp.abs(mean[:, :-1])
+    # Sizes for relative tolerances: of the gains' entries (m, m, p, p), of each noise (m,), and of the product of entry
+    # (i, a) of a gain and noise j, at (i, j, a).
+    gain_size = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(mean_size, mean_size)
+    noise_size = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    cross_size = xp.sqrt(xp.einsum("iiaa->ia", gain_size))[:, None, :] * noise_size[:, None]
+    multiples, residual = _fit_multiples(gains, shape)
+    largest, noise_is_largest = _find_largest_noise(noises)
+    gains_are_multiples = xp.all(residual <= PROPORTIONAL_TOLERANCE * gain_size)
+    is_uncorrelated = xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (cross_size + cross_size.swapaxes(0, 1)))
+    # max_v s_v M y y' M' + N_max, the latter as what multiplies the constant 1.
+    constant = np.zeros((mean.shape[1], mean.shape[1]))
+    constant[-1, -1] = 1.0
+    widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
+    dominating = widened + largest[:, :, None, None] * constant
+    return dominating, gains_are_multiples & is_uncorrelated & noise_is_largest
+
+
+def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
+    """Return the s_v (law,) of least squares in gains_v = s_v `shape`, and how far each entry is off it."""
+    xp = library(gains, shape)
+    size = xp.sum(shape**2)
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
+    return multiples, xp.abs(gains - multiples[:, None, None, None, None] * shape)
+
+
+def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
+    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether all N_max - N_v >= 0."""
+    xp = library(noises)
+    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
+    # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    return largest, xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE
+
+
+def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:
+    """Return bounds of spread, shift and power of a channel, from the interval in which each of its moments lies.
+
+    With the nominal mean H0, and raw second moments and means m of any law, the spread is raw - H0 m' - m H0' + H0 H0',
+    the shift (m - H0)(m - H0)', and the power raw without the constant. A bound is a map: a center, and a radius of
+    each entry.
+
+    Args:
+        channel: the channel.
+        nominal: its moments up to the second under the nominal law, for their shape.
+        mean: H0 (m, p + 1).
+    """
+    low, high = channel.moment_interval(2)
+    xp = library(low, high, mean)
+    # Middle and half width of each moment.
+    middle = JointMoments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
+    half = JointMoments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
+    raw_radius = xp.abs(half.second)
+    mean_radius = half.mean[:-1]
+    spread, _, power = tensors_of_law(middle, mean)
+    reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
+    # Radii add up by the triangle inequality.
+    spread_radius = (
+        raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
+    )
+    return [
+        QuadraticMap(spread, spread_radius),
+        QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
+        QuadraticMap(power, drop_constant(raw_radius)),
+    ]

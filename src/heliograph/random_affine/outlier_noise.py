@@ -1,0 +1,297 @@
+"""Noise laws with outliers: Student's and contaminated Gaussian noise, and the branches that a robust filter reads."""
+
+from collections.abc import Sequence
+from math import prod
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics import check
+from heliograph.numerics.check import TINY, array, check_count, fail, rank, scalar
+from heliograph.numerics.numpy_or_jax import is_traced, library, plain, scipy_for
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.random_affine.laws.law import draw_index
+from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers
+from heliograph.random_affine.moments.monomials import Exponents
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Number, Square, Vector
+
+PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
+"""Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
+LEAST_SHARE = 1e-12  # of each of them: none is excluded
+
+Stack = Float[jax.Array | np.ndarray, "branches n n"]
+
+
+class StudentT(AbstractNoise):
+    """Student's t noise: Gaussian noise of covariance `scale` / l with one l of the gamma law of mean 1 for the vector.
+
+    l is chi-squared of `degrees` nu divided by nu. Its covariance is scale nu / (nu - 2), which exists above 2 degrees;
+    a filter that needs it refuses fewer. Large nu is Gaussian noise.
+
+    Shapes: scale (n, n), or a number for one component.
+
+    Raises:
+        ValueError: a scale that is no covariance, degrees that are not positive.
+    Source: Lange, Little and Taylor, Robust statistical modeling using the t distribution (1989).
+    """
+
+    scale: Square
+    degrees: Float[jax.Array | np.ndarray, ""]
+    mean: Vector
+
+    def __init__(self, scale: ArrayLike, degrees: ArrayLike):
+        self.scale = check.covariance("scale of Student's law", scale, _size_of_number(scale))
+        self.degrees = scalar("degrees of Student's law", degrees, TINY)
+        self.mean = np.zeros(self.scale.shape[-1])
+
+    @property  # type: ignore[misc]
+    def covariance(self) -> Square:  # type: ignore[override]
+        """Covariance of the noise: the scale times nu / (nu - 2).
+
+        Raises:
+            ValueError: at most 2 degrees.
+        """
+        nu = self.degrees
+        if not is_traced(nu) and nu <= 2:
+            expected = "more than 2, below which it has no covariance (robust_filter with its score update needs none)"
+            raise fail("degrees of Student's law", expected, f"{float(nu):g}")
+        total: Square = self.scale * (nu / (nu - 2))
+        return total
+
+    @property
+    def has_outliers(self) -> bool:
+        """Always True."""
+        return True
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Always True."""
+        return True
+
+    def branches(self) -> GaussianBranches:
+        """Return each component as a mixture of Gaussian branches, one for each of the PRECISIONS."""
+        xp, n = library(self.degrees, self.scale), self.dimension
+        shape = (n, len(PRECISIONS))
+        shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
+        return GaussianBranches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """Return the Gaussian noise of the scale."""
+        return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw A w / sqrt(l), w standard normal."""
+        first, second = jax.random.split(key)
+        half = jnp.asarray(self.degrees, dtype=float) / 2
+        precision = jax.random.gamma(second, half, dtype=float) / half
+        return Gaussian(self.scale).sample(first) / jnp.sqrt(precision)
+
+    def moment(self, powers: Exponents) -> Number:
+        """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
+
+        Raises:
+            ValueError: an order of at least `degrees`, whose moment does not exist.
+        """
+        order, nu = sum(powers), self.degrees
+        if order % 2:
+            return 0.0
+        if not is_traced(nu) and 0 < nu <= order:
+            raise fail(f"degrees of Student's law in moments of order {order}", f"more than {order}", f"{float(nu):g}")
+        return prod((plain(nu / (nu - 2 * i)) for i in range(1, order // 2 + 1)), start=1.0) * Gaussian(
+            self.scale
+        ).moment(powers)
+
+
+class Contaminated(AbstractNoise):
+    """Gaussian noise with outliers: covariance R, and with probability `share` mean `bias` and `outlier_covariance`.
+
+    Outlying branches of several kinds have a list of shares, with as many covariances (or variances) and biases. The
+    covariance of the whole is sum_j p_j (R_j + m_j m_j') - m m', its mean m = sum_j p_j m_j.
+
+    `bounded`: the share is at most this one and the outliers' second moment at most this one (`at_most`), so that the
+    covariance dominates and filters claim "upper" where they else claim "exact".
+
+    Shapes: covariance, outlier_covariance (n, n) or a number; share a number; bias a number or (n,). Of several
+    kinds: share (kinds,), outlier_covariance (kinds,) or (kinds, n, n), bias (kinds,) or (kinds, n).
+
+    Raises:
+        ValueError: a share outside [0, 1] (or several whose sum is), covariances that are none, shapes that do not fit.
+    Source: Tukey, A survey of sampling from contaminated distributions (1960).
+    """
+
+    shares: Vector
+    means: Matrix
+    covariances: Stack
+    mean: Vector
+    covariance: Square
+    bounded: bool = eqx.field(static=True)
+
+    def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        # Shares, covariances and biases of the kinds of outliers, one each.
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
+        n = inlier.shape[-1]
+        outlier_shares, are_several = _read_shares(share)
+        kinds = len(outlier_shares)
+        outliers = _read_matrices("covariance of the outliers", outlier_covariance, kinds, are_several)
+        biases = _read_matrices("bias of the outliers", bias, kinds, are_several)
+        xp = library(inlier, outlier_shares, outliers, biases)
+        spreads = [check.covariance("covariance of the outliers", r, n) for r in outliers]
+        centers = [xp.broadcast_to(array("bias of the outliers", b, (n,) if rank("bias", b) else ()), (n,))
+                   for b in biases]  # fmt: skip
+        # The first branch is the noise without outliers; mean and covariance are those of the mixture.
+        self.shares = xp.concatenate([xp.stack([1 - sum(outlier_shares)]), xp.stack(outlier_shares)])
+        self.means = xp.stack([xp.zeros(n), *centers])
+        self.covariances = xp.stack([inlier, *spreads])
+        self.mean = self.shares @ self.means
+        deviations = self.means - self.mean
+        between = deviations[:, :, None] * deviations[:, None]
+        second = self.covariances + between
+        self.covariance = xp.einsum("j,jab->ab", self.shares, second)
+        self.bounded = False
+
+    @classmethod
+    def one_sided(cls, covariance: ArrayLike, share: ArrayLike, mean: ArrayLike, slices: int = 6) -> "Contaminated":
+        """Return the Gaussian noise to which, with probability `share`, an exponential delay of this mean is added.
+
+        The exponential law as `slices` of equal probability, each with its mean and variance: the mean and the variance
+        of the whole are those of the law. `mean` is a number or one for each component, of either sign.
+
+        Raises:
+            ValueError: as for the class; no slice.
+        """
+        count = check_count("slices of an exponential bias", slices)
+        inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
+        n = inlier.shape[-1]
+        factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
+        center, variance = _slice_exponential(count)
+        xp = library(factor, inlier, share)
+        units = xp.broadcast_to(factor, (n,))
+        slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
+        spreads = [inlier + v * xp.outer(units, units) for v in variance]
+        return cls(inlier, xp.stack([slice_share] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
+
+    @classmethod
+    def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
+        """Return zero-mean noise known by bounds: at most this share of outliers, E[o o'] at most this matrix.
+
+        (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
+
+        Raises:
+            ValueError: as for the class; a second moment of outliers that does not dominate the covariance.
+        """
+        law = cls(covariance, share, outlier_second_moment)
+        if not is_traced(law.covariances):
+            least = np.min(np.linalg.eigvalsh(law.covariances[1] - law.covariances[0]))
+            if least < -1e-10 * np.max(np.abs(law.covariances[1])):
+                raise fail("second moment of the outliers", "one that is at least the covariance of the others",
+                           f"a difference with eigenvalue {least:.3g}")  # fmt: skip
+        object.__setattr__(law, "bounded", True)
+        return law
+
+    @property
+    def has_outliers(self) -> bool:
+        """Always True."""
+        return True
+
+    @property
+    def is_symmetric(self) -> bool:
+        """True where no branch is biased."""
+        return not np.any(np.asarray(self.means) != 0)
+
+    def branches(self) -> GaussianBranches:
+        """Return each component as a mixture of Gaussian branches about the mean, those of the law."""
+        xp, n = library(self.shares), self.dimension
+        shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
+        variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
+        return GaussianBranches(shares, (self.means - self.mean).T, variances)
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """Return the mean and covariance of the first branch: the noise without outliers."""
+        return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the branch by the shares, then the noise from it."""
+        first, second = jax.random.split(key)
+        branch = draw_index(self.shares, first)
+        laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
+        return jnp.stack([law.sample(second) for law in laws])[branch]
+
+    def moment(self, powers: Exponents) -> Number:
+        """Return the mean of the branches' moments."""
+        items = zip(self.shares, self.covariances, self.means, strict=True)
+        return sum((plain(p) * Gaussian(r, m).moment(powers) for p, r, m in items), start=0.0)
+
+
+def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
+    """Return the gamma law's mass of l between geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
+    xp: Any = library(degrees)
+    half = xp.asarray(degrees) / 2
+    between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
+    below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half, between.shape), between * half)
+    masses = xp.diff(xp.concatenate([np.zeros(1), below, np.ones(1)]))
+    masses = xp.maximum(masses, LEAST_SHARE)
+    shares: Vector = masses / xp.sum(masses)
+    return shares
+
+
+def has_bounded_noise(*parts: PyTree) -> bool:
+    """Return whether some noise in these parts of a network is known by a bound of its covariance alone."""
+
+    def is_law(leaf: object) -> bool:
+        """Return whether a leaf is a noise law that may be a bound."""
+        return isinstance(leaf, Contaminated)
+
+    return any(leaf.bounded for leaf in jax.tree.leaves(parts, is_leaf=is_law) if is_law(leaf))
+
+
+def _size_of_number(value: ArrayLike) -> int | None:
+    """Return the size of the matrix that a number is, 1; None of a matrix, which has its own."""
+    return None if rank("covariance", value) else 1
+
+
+def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
+    """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
+    if not rank("share of outliers", share):
+        return [scalar("share of outliers", share, 0.0, 1.0)], False
+    values = array("shares of outliers", share, ("kinds",))
+    if not len(values):
+        raise fail("shares of outliers", "at least one", "none")
+    total = sum(scalar("share of outliers", value, 0.0, 1.0) for value in values)
+    scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12) if not is_traced(total) else None
+    return list(values), True
+
+
+def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
+    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many."""
+    if not several:
+        return [value]
+    if not rank(name, value):
+        return [value] * count
+    parts: list[ArrayLike] = list(cast(Sequence[ArrayLike], value))
+    if len(parts) != count:
+        raise fail(name, f"one for each of the {count} shares", len(parts))
+    return parts
+
+
+def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean and variance of the exponential law of mean 1 between its quantiles k / count.
+
+    With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
+    """
+    survival = 1 - np.arange(count + 1) / count
+    time = -np.log(np.where(survival > 0, survival, 1.0))
+    first = count * -np.diff(survival * (time + 1))
+    second = count * -np.diff(survival * (time**2 + 2 * time + 2))
+    return first, second - first**2
+
+
+def _log_or_minus_infinity(value: Vector) -> Vector:
+    """Return the logarithms, -inf of zero without a warning."""
+    if is_traced(value):
+        return jnp.log(value)
+    with np.errstate(divide="ignore"):
+        logarithm: Vector = np.log(np.maximum(value, 0.0))
+    return logarithm

@@ -1,0 +1,345 @@
+"""Maps made of independent maps: in series, and side by side."""
+
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.caching import cache_by_object
+from heliograph.numerics.check import fail
+from heliograph.numerics.numpy_or_jax import stack_parts
+from heliograph.numerics.types import Float, PyTree
+from heliograph.random_affine.base import (
+    AbstractRandomAffine,
+    ArrivalOutcome,
+    KnownGains,
+    SameNoise,
+    check_forgets,
+    check_maps,
+)
+from heliograph.random_affine.composite import ARROW, AbstractComposite, describe_maps_side_by_side
+from heliograph.random_affine.hop import known
+from heliograph.random_affine.moments.gain_and_disturbance_moments import DisturbedGain, stack_on_shared_inputs
+from heliograph.random_affine.moments.interval_products import (
+    Interval,
+    multiply_interval_polynomials,
+    multiply_matrices,
+)
+from heliograph.random_affine.moments.mixture_components import AffineComponent, combine_atoms
+from heliograph.random_affine.moments.monomials import (
+    JointMoments,
+    count_monomials,
+    list_exponents,
+    multiply_polynomials,
+    position,
+    refuse_if_too_large,
+)
+from heliograph.random_affine.moments.signal_path import ChannelPosition, SignalMoment, Visit
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
+
+OUTCOME_LIMIT = 1024  # sets of losses that are listed
+Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
+
+
+class AbstractCombination(AbstractComposite):
+    """Map made of several maps: its state is the tuple of theirs, and all of them move at each draw."""
+
+    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the first map."""
+        return self.maps[0].inputs
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """Return the first states of the maps, one for each; none of maps that forget."""
+        keys = jax.random.split(key, len(self.maps))
+        return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
+
+    def degree_in(self, identity: str) -> int:
+        """Return the largest degree of a map, since they stand side by side."""
+        return max(affine.degree_in(identity) for affine in self.maps)
+
+    def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Decide whether another map is of this kind and each of its maps covered by that of this one."""
+        if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
+            return False
+        return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
+
+    def _draw_each(
+        self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
+    ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
+        """Return the next state and one H of each map."""
+        states = state if self.remembers else ((),) * len(self.maps)
+        pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
+        return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
+
+
+def _join_outcomes(
+    a: list[ArrivalOutcome],
+    b: list[ArrivalOutcome],
+    join: Callable[[ArrivalOutcome, ArrivalOutcome], tuple[AbstractRandomAffine, np.ndarray]],
+) -> list[ArrivalOutcome]:
+    """Return the sets of losses of two independent parts together; join(x, y) gives the map and what arrives."""
+    if len(a) * len(b) > OUTCOME_LIMIT:
+        raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
+    return [ArrivalOutcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
+
+
+class Series(AbstractCombination):
+    """Series of independent maps, z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k].
+
+    Args:
+        maps: the maps, first the one that takes y; each takes as many inputs as the one before has outputs.
+    """
+
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        self.maps = check_maps("series", maps)
+        for first, second in zip(self.maps, self.maps[1:], strict=False):
+            if first.outputs != second.inputs:
+                raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the last map."""
+        return self.maps[-1].outputs
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw each map, and multiply, the first map's matrix rightmost; rows of lost outputs are NaN."""
+        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
+        then = _compose_draws if self.erases else jnp.matmul
+        return state, reduce(lambda h, matrix: then(matrix, h), drawn)
+
+    @cache_by_object
+    def moments(self, order: int) -> JointMoments:
+        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        check_forgets("moments of a map", self)
+        matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
+                        self.maps[0].moments(order).matrix)  # fmt: skip
+        return JointMoments(matrix, self.outputs, self.inputs, order)
+
+    @cache_by_object
+    def corner_moments(self, order: int) -> Corners:
+        """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices."""
+        first, *rest = (m.corner_moments(order) for m in self.maps)
+        for corners in rest:
+            products = corners @ first[:, None]
+            first = products.reshape(-1, *products.shape[2:])
+        return first
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Return the interval of E[Sym^order(H)]: the matrix product of the intervals of all maps."""
+        intervals = [m.moment_interval(order) for m in self.maps]
+        return reduce(lambda before, after: multiply_matrices(after, before), intervals)
+
+    @property
+    def in_series(self) -> list[AbstractRandomAffine]:
+        """Its maps, those of series within it too."""
+        return [m for affine in self.maps for m in affine.in_series]
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Return for each output whether its gain is known behind all maps in turn, from the same of each input."""
+        return reduce(lambda before, affine: affine.carry_known_gains(before), self.maps, known)
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Return the outputs that are angles behind each map in turn."""
+        return reduce(lambda before, affine: affine.carry_angles(before), self.maps, sent)
+
+    def degree_in(self, identity: str) -> int:
+        """Return the sum of the maps' degrees, since they are multiplied."""
+        return sum(affine.degree_in(identity) for affine in self.maps)
+
+    def condition_on_arrival(self) -> AbstractRandomAffine:
+        """Return the same series of maps through which everything arrives."""
+        return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
+
+    def _outcomes(self) -> list[ArrivalOutcome]:
+        """Return the sets of losses: an output is lost where a map loses it, or has a gain on what one before lost."""
+        return reduce(partial(_join_outcomes, join=_join_outcomes_in_series), (m.list_outcomes() for m in self.maps))
+
+    def list_atoms(self) -> list[AffineComponent]:
+        """Return every atom of each map, one after another."""
+        return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.then)
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Return the joint moments of each map, then of the next."""
+        return reduce(DisturbedGain.then, (affine.disturb_gain() for affine in self.maps))
+
+    def in_words(self) -> str:
+        """Return the maps in words, with arrows between them."""
+        return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Return the series without the noise of its last map where its law has outliers, and that noise."""
+        *before, last = self.maps
+        plain, noise = last.detach_outliers()
+        return (self, None) if noise is None else (Series([*before, plain]), noise)
+
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
+        """Visit the maps in their order, each with the signal that comes through those before it."""
+        visited, signal = list[AbstractRandomAffine](), position.signal
+        for i, affine in enumerate(self.maps):
+            changed, position = affine.visit_hops(visit, position._replace(signal=signal))
+            visited.append(changed)
+            if signal is not None and i + 1 < len(self.maps):
+                signal = affine.carry_signal(signal)
+        return self.rebuilt(*visited), position
+
+    def carry_signal(self, signal: SignalMoment) -> SignalMoment:
+        """Return the signal behind each map in turn."""
+        return reduce(lambda before, affine: affine.carry_signal(before), self.maps, signal)
+
+
+def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
+    received = known(np.diag(x.arrived.astype(float)))
+    power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
+    uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]
+    return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
+
+
+def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
+    """Return the product of two drawn maps, whose NaN rows are lost outputs: what has a gain on these is lost too."""
+    lost = jnp.isnan(first).any(axis=1)
+    reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
+    return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
+
+
+class Stack(AbstractCombination):
+    """Stack of independent maps of the same y, outputs one above the other; moments are products of polynomials."""
+
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        self.maps = check_maps("stack", maps)
+        if len({m.inputs for m in self.maps}) != 1:
+            raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])
+
+    @property
+    def outputs(self) -> int:
+        """Sum of the maps' outputs."""
+        return sum(m.outputs for m in self.maps)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw each map and stack the rows."""
+        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
+        rows = [h[:-1] for h in drawn]
+        return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
+
+    @cache_by_object
+    def moments(self, order: int) -> JointMoments:
+        """Return E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
+        check_forgets("moments of a map", self)
+        refuse_if_too_large(
+            count_monomials(self.outputs + 1, order),
+            count_monomials(self.inputs + 1, order),
+            f"moments of order {order}",
+        )
+        items = [m.moments(order) for m in self.maps]
+        tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
+        return JointMoments(
+            stack_parts(multiply_moments_of_parts(self, order, tables, multiply_polynomials)),
+            self.outputs,
+            self.inputs,
+            order,
+        )
+
+    def _interval_of_parts(self, order: int) -> Interval:
+        """Return the interval of E[Sym^order(H)]: row by row the product of the maps' interval polynomials."""
+        tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
+        rows = stack_parts(multiply_moments_of_parts(self, order, tables, multiply_interval_polynomials))
+        return rows[:, 0], rows[:, 1]
+
+    @property
+    def in_parallel(self) -> list[AbstractRandomAffine]:
+        """Its maps, those of stacks within it too."""
+        return [m for affine in self.maps for m in affine.in_parallel]
+
+    def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
+        """Return whether `own` is a stack of maps that this one's cover one by one."""
+        return self.covers_maps(own, same_noise)
+
+    def carry_known_gains(self, known: KnownGains) -> KnownGains:
+        """Return for each output whether its gain is known, map after map, from the same of each input."""
+        return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
+
+    def carry_angles(self, sent: Angles) -> Angles:
+        """Return the angles of the maps, whose outputs stand one after another."""
+        starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
+        items = zip(starts, self.maps, strict=False)
+        return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
+
+    def condition_on_arrival(self) -> AbstractRandomAffine:
+        """Return the same stack of maps through which everything arrives."""
+        return self.rebuilt(*(affine.condition_on_arrival() for affine in self.maps))
+
+    def _outcomes(self) -> list[ArrivalOutcome]:
+        """Return every set of losses of each map with every one of the others."""
+        return reduce(partial(_join_outcomes, join=_join_outcomes_in_stack), (m.list_outcomes() for m in self.maps))
+
+    def list_atoms(self) -> list[AffineComponent]:
+        """Return every atom of each map, one above another."""
+        return combine_atoms([affine.list_atoms() for affine in self.maps], AffineComponent.above)
+
+    def disturb_gain(self) -> DisturbedGain:
+        """Return the joint moments of the maps, one above another."""
+        return stack_on_shared_inputs([affine.disturb_gain() for affine in self.maps], self.inputs)
+
+    def in_words(self) -> str:
+        """Return the maps in words, between bars."""
+        return describe_maps_side_by_side(self.maps)
+
+    def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
+        """Return the stack without the noises of its maps where their laws have outliers, and these noises."""
+        parts = [affine.detach_outliers() for affine in self.maps]
+        if all(noise is None for _, noise in parts):
+            return self, None
+        noises = [noise or Gaussian(np.zeros((plain.outputs, plain.outputs))) for plain, noise in parts]
+        return Stack([plain for plain, _ in parts]), Independent(noises)
+
+    def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
+        """Visit each map as one part; return the whole as they became, and the place after it."""
+        visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "part")]
+        return self.rebuilt(*visited), position
+
+
+def _join_outcomes_in_stack(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
+    """Return y below x, and which of the outputs of both arrive."""
+    return Stack([x.map, y.map]), np.concatenate([x.arrived, y.arrived])
+
+
+def multiply_moments_of_parts(
+    channel: Stack, order: int, tables: list[list[Any]], times: Callable[..., Any]
+) -> list[Any]:
+    """Return E[z^a | y] = prod_parts E[z_part^(a_part) | y] for each power a, as polynomials in y.
+
+    Args:
+        channel: the stack.
+        order: degree of the monomials of (z, 1).
+        tables: of each part and degree its polynomials (..., rows, columns); None of degree 0.
+        times: product of two polynomials, from (a, degree of a, b, degree of b, number of variables).
+    """
+    variables, rows = channel.inputs + 1, []
+    for powers in list_exponents(channel.outputs + 1, order):
+        polynomial, degree = np.ones(1), 0
+        start = 0  # first output of the part
+        for part, table in zip(channel.maps, tables, strict=True):
+            # The powers of this part's outputs, their sum, and the part's polynomial of them; 1 where all are 0.
+            a = powers[start : start + part.outputs]
+            start, degree_of_part = start + part.outputs, sum(a)
+            if degree_of_part:
+                factor = table[degree_of_part][..., position(part.outputs + 1, degree_of_part)[(*a, 0)], :]
+                polynomial = times(polynomial, degree, factor, degree_of_part, variables)
+                degree += degree_of_part
+        # Times 1^(order - |a|), so that all rows have the degree `order`.
+        power_of_one = np.zeros(count_monomials(variables, powers[-1]))
+        power_of_one[-1] = 1.0
+        rows.append(times(polynomial, degree, power_of_one, powers[-1], variables))
+    return rows

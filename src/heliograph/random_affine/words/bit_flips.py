@@ -1,0 +1,177 @@
+"""Words of bits on their way: each bit that is decoded and forwarded is flipped with a probability."""
+
+from collections.abc import Sequence
+from itertools import product
+from math import prod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.check import check_count, fail, flag, items, scalar, show_value
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.composite import write_percentage
+from heliograph.random_affine.hop import GainAndNoise, known
+from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
+from heliograph.random_affine.moments.monomials import JointMoments
+from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.series_and_stack import Series, Stack
+
+MOST_ATOMS = 64  # of the error rate of a chain
+
+
+class Flips(AbstractRandomAffine):
+    """A link of words in natural binary, each bit of which is flipped with the probability p, independently.
+
+    What a flipped bit does depends on the words, so that moments are asked of `about_centre`: with g = 1 - 2p a word q
+    of centre c arrives as q' with E[q' - c | q] = g (q - c) and Var[q' | q] = U (1 - g^2), U the variance of a word
+    all of whose values are equally likely, whatever q is.
+
+    Args:
+        error: law of p, `Constant` or `Discrete`.
+        dimension: number of words of a message.
+        per_message: True if one p is drawn for all words of a message, False if one for each word.
+    """
+
+    error: Constant | Discrete
+    dimension: int = eqx.field(static=True)
+    per_message: bool = eqx.field(static=True)
+
+    @property
+    def outputs(self) -> int:
+        """Length of z: one number for each word."""
+        return self.dimension
+
+    @property
+    def inputs(self) -> int:
+        """Length of y: one number for each word."""
+        return self.dimension
+
+    @property
+    def gain(self) -> Constant | Discrete:
+        """Law of the gain g = 1 - 2p, p the probability that a bit is flipped."""
+        if isinstance(self.error, Constant):
+            return Constant(1 - 2 * self.error.value)
+        return Discrete(1 - 2 * self.error.values, self.error.probabilities)
+
+    def about_centre(self, power: Float[np.ndarray, " words"]) -> AbstractRandomAffine:
+        """Return the random affine map of q - c: gain g, and noise of variance U (1 - E g^2).
+
+        Args:
+            power: U of each word.
+        """
+        left = 1 - float(self.gain.moment(2))
+        if self.per_message or self.dimension == 1 or isinstance(self.error, Constant):
+            return GainAndNoise(self.gain, np.eye(self.dimension), Gaussian(left * np.diag(power)))
+        rows = np.eye(self.dimension)
+        alone = [GainAndNoise(self.gain, np.eye(1), Gaussian([[left * u]])) for u in power]
+        return Stack([Series([known(rows[i : i + 1]), link]) for i, link in enumerate(alone)])
+
+    def on_bits(self, bits: int, beside: int) -> "BitFlips":
+        """Return the map of words that are written as `bits` numbers of -1 or 1, and `beside` numbers that pass."""
+        return BitFlips(self.error, self.dimension, self.per_message, bits, beside)
+
+    def moments(self, order: int) -> JointMoments:
+        """Refuse: what a flipped bit does depends on the words."""
+        raise fail(
+            "channel of words", "a filter that is given the encoder of the words (encoder=...)", "one that is not"
+        )
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Refuse: what a flipped bit does depends on the words."""
+        raise fail("channel of words", "a node that has the encoder of the words (encoder=...)", "one that has none")
+
+    def in_words(self) -> str:
+        """Return how many of the bits flip."""
+        return f"words, {write_percentage(self.error.moment(1))} of bits flipped"
+
+
+class BitFlips(AbstractRandomAffine):
+    """The link of words as one of their bits: each is multiplied by -1 with the probability p, else by 1.
+
+    Of each word stand `bits` numbers -1 or 1, and behind them `beside` numbers that arrive as they are.
+    """
+
+    error: Constant | Discrete
+    dimension: int = eqx.field(static=True)
+    per_message: bool = eqx.field(static=True)
+    bits: int = eqx.field(static=True)
+    beside: int = eqx.field(static=True)
+
+    @property
+    def outputs(self) -> int:
+        """Length of z: all bits of all words, and what stands beside them."""
+        return self.dimension * (self.bits + self.beside)
+
+    @property
+    def inputs(self) -> int:
+        """Length of y: that of z."""
+        return self.outputs
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw p, of the message or of each word, and the bits that flip."""
+        rate_key, bit_key = jax.random.split(key)
+        if self.per_message:
+            p = jnp.full(self.dimension, self.error.sample(rate_key))
+        else:
+            p = jnp.stack([self.error.sample(k) for k in jax.random.split(rate_key, self.dimension)])
+        drawn = jax.random.uniform(bit_key, (self.dimension, self.bits), dtype=float)
+        signs = jnp.where(drawn < p[:, None], -1.0, 1.0)
+        gains = jnp.concatenate([signs, jnp.ones((self.dimension, self.beside))], axis=1).reshape(-1)
+        return jnp.diag(jnp.append(gains, 1.0))
+
+
+def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: bool = False) -> Flips:
+    """Return the chain of hops that decode words and forward them, each flipping every bit with its own probability.
+
+    A bit of the chain is flipped with the probability p of g = 1 - 2p = prod_h (1 - 2 p_h). The words are those of the
+    node's encoder (`Words`), in natural binary. An error rate that is a `Discrete` law is drawn anew at each step.
+
+    `Series([decode_and_forward([.01]), Stack([decode_and_forward([.02]), decode_and_forward([.005])])])` sends one word
+    over two paths behind a common first hop. A packet with a checksum loses what has a flipped bit:
+    `erasure(perfect(), (1 - p) ** bits)`.
+
+    Args:
+        hops: error rates of the hops in the order of the way: numbers from 0 to 0.5, or `Discrete` laws of them.
+        dimension: number of words of a message (default 1).
+        per_message: True if the error rate that is drawn is that of all words of a message; False, one for each word,
+            unless given.
+
+    Raises:
+        ValueError: no hop, what is no error rate, a rate for each bit (then the mean of a word is not affine in the
+            word), laws of more than 64 values together.
+
+    Source: natural binary words over binary symmetric channels; E[q' | q] = c + g (q - c).
+    """
+    rates = items("error rates of hops", hops, "numbers from 0 to 0.5, or Discrete laws of them")
+    if not rates:
+        raise fail("error rates of hops", "at least one", "none")
+    laws = [_read_error_rate(rate) for rate in rates]
+    atoms = [law.list_atoms() for law in laws]
+    if prod(len(a) for a in atoms) > MOST_ATOMS:
+        raise fail("error rates of hops", f"laws of at most {MOST_ATOMS} values together", [len(a) for a in atoms])
+    gains, shares = list[float](), list[float]()
+    for combination in product(*atoms):
+        gains.append(prod(1 - 2 * float(p) for _, p in combination))
+        shares.append(prod(float(share) for share, _ in combination))
+    values = (1 - np.asarray(gains)) / 2
+    error = Constant(values[0]) if len(values) == 1 else Discrete(values, np.asarray(shares))
+    return Flips(error, check_count("words of a message", dimension), flag("per_message", per_message))
+
+
+def _read_error_rate(rate: object) -> Constant | Discrete:
+    """Return the law of a hop's error rate."""
+    expected = "one number from 0 to 0.5 for all bits of the word, or a Discrete law of such numbers"
+    if isinstance(rate, Discrete):
+        values = np.asarray(rate.values)
+        if np.any(rate.radius) or values.min() < 0 or values.max() > 0.5:
+            raise fail("error rate of a hop", expected, show_value(values.tolist()))
+        return rate
+    if isinstance(rate, AbstractLaw) and not isinstance(rate, Constant):
+        raise fail("error rate of a hop", expected, type(rate).__name__)
+    value = rate.value if isinstance(rate, Constant) else rate
+    if np.ndim(value):  # type: ignore[arg-type]
+        raise fail("error rate of a hop", f"{expected}; with other rates a word's mean is not affine in it", "several")
+    return Constant(scalar("error rate of a hop", value, 0.0, 0.5))  # type: ignore[arg-type]

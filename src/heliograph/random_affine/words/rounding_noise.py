@@ -1,0 +1,210 @@
+"""Noise of a measurement that is rounded to steps: the sensor's own, and the error of rounding, by the dither."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns
+from heliograph.numerics.check import fail
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Float, PyTree
+from heliograph.random_affine.moments.mixture_components import GaussianBranches, NoiseWithoutOutliers, SignalNoise
+from heliograph.random_affine.moments.monomials import Exponents
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Number, Square, Vector
+
+TERMS = 32  # of the series of E f(1 - f); what is left is added as a bound
+DITHERLESS = 1 - 1e-9  # deviations of Gaussian noise, in steps, from which on rounding needs no other dither
+
+
+class RoundingError(NamedTuple):
+    """Variances of q - y (less a dither that is taken off) and of q - y itself, in steps squared."""
+
+    error: float
+    whole: float
+
+
+LARGEST = {  # whatever y is
+    "none": RoundingError(1 / 12, 1 / 12),  # of a y whose density is flat over a step
+    "triangular": RoundingError(1 / 4, 1 / 4),
+    "stochastic": RoundingError(1 / 4, 1 / 4),
+    "subtracted": RoundingError(1 / 12, 1 / 4),
+}
+
+
+class RoundedNoise(AbstractNoise):
+    """Noise v + e of a measurement y that is rounded to steps of D: v the sensor's, e the error of rounding.
+
+    Of the signal y - `centre`: its mean is E v - centre. By the dither, with f the place of y between two steps,
+    "triangular" Var e = D^2/4; "stochastic" D^2 E f(1 - f), at most D^2/4; "subtracted" D^2/12, and with the dither
+    D^2 E f(1 - f); "none" D^2/12, which holds where v is Gaussian with a deviation of a step or more.
+
+    Args:
+        source: law of v.
+        step: D of each component.
+        half: half the range, so that y = centre - half lies on a step.
+        centre: taken off y.
+        dither: how y was dithered.
+        gaussian: True if y is Gaussian, so that E f(1 - f) is known by its moments; False if D^2/4 bounds it.
+        matters: True if the second moment of the rounded signal enters what is claimed, as behind a random gain.
+    """
+
+    source: AbstractNoise
+    step: Vector
+    half: Vector
+    centre: Vector
+    dither: str = eqx.field(static=True)
+    gaussian: bool = eqx.field(static=True)
+    matters: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        source: AbstractNoise,
+        step: Vector,
+        half: Vector,
+        centre: Vector,
+        dither: str,
+        gaussian: bool = False,
+        matters: bool = False,
+    ):
+        self.source, self.step, self.half, self.centre = source, step, half, centre
+        self.dither, self.gaussian, self.matters = dither, gaussian, matters
+
+    @property  # type: ignore[misc]
+    def mean(self) -> Vector:  # type: ignore[override]
+        """Mean of the sensor's noise v less the centre."""
+        mean: Vector = self.source.mean - self.centre
+        return mean
+
+    @property  # type: ignore[misc]
+    def covariance(self) -> Square:  # type: ignore[override]
+        """Cov v + Var e, the largest that e may have."""
+        covariance: Square = self.source.covariance + LARGEST[self.dither].error * self._squares()
+        return covariance
+
+    @property
+    def columns(self) -> WeightedColumns:
+        """Covariance as columns: those of v, then those of the rounding error e."""
+        return self._with_error(LARGEST[self.dither].error * self.step**2)
+
+    @property
+    def has_outliers(self) -> bool:
+        """True if v has."""
+        return self.source.has_outliers
+
+    @property
+    def is_exact(self) -> bool:
+        """True if Var e is known and e has mean 0 whatever the state is."""
+        match self.dither:
+            case "triangular":
+                return True
+            case "stochastic":
+                return self.gaussian
+            case "subtracted":
+                return self.gaussian or not self.matters
+        return self._dithers_itself
+
+    @property
+    def is_bounded(self) -> bool:
+        """True if e has mean 0 whatever the state is, and the largest of its variances stands for it."""
+        return not self.is_exact and self.dither in ("stochastic", "subtracted")
+
+    @property
+    def _dithers_itself(self) -> bool:
+        """True if v is Gaussian with a deviation of a step or more in every direction."""
+        if not isinstance(self.source, Gaussian):
+            return False
+        step = np.asarray(self.step)
+        unit = np.asarray(self.source.covariance) / (step[..., :, None] * step[..., None, :])
+        return bool(np.all(np.linalg.eigvalsh(unit)[..., 0] >= DITHERLESS))
+
+    def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
+        """Return v + e beside a Gaussian signal of these moments: with E f(1 - f) from its series."""
+        known = LARGEST[self.dither]
+        if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
+            whole = self.source.covariance + known.whole * self._squares()
+            return SignalNoise(self.columns, whole)
+        share = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
+        error = known.error if self.dither == "subtracted" else share
+        whole = jnp.asarray(self.source.covariance) + jnp.diag(share * jnp.asarray(self.step) ** 2)
+        return SignalNoise(self._with_error(error * self.step**2), whole)
+
+    def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
+        """Return an upper bound of E f (1 - f), f the place of y between two words in steps D, for y of N(m, s^2).
+
+        Dithered rounding has the variance D^2 f (1 - f). With the lowest word `low`
+
+        E f (1 - f) = 1/6 - sum_k exp(-2 pi^2 k^2 s^2 / D^2) cos(2 pi k (m - low) / D) / (pi k)^2. The series is cut
+        after K = TERMS, and the bound of its tail is added: sum_{k > K} 1 / (pi k)^2 <= 1 / (pi^2 K).
+        """
+        k = np.arange(1, TERMS + 1)[:, None]
+        relative_variance = jnp.asarray(variances) / jnp.asarray(self.step) ** 2
+        place = (jnp.asarray(mean) + jnp.asarray(self.half)) / jnp.asarray(self.step)
+        place = place - jnp.floor(place)
+        damped = jnp.exp(-2 * np.pi**2 * k**2 * relative_variance) / (np.pi * k) ** 2
+        tail = jnp.exp(-2 * np.pi**2 * TERMS**2 * relative_variance) / (np.pi**2 * TERMS)
+        share = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + tail
+        return jnp.clip(share, 0.0, 0.25)
+
+    def _squares(self) -> Square:
+        """Return diag(D^2), the squares of the steps on a diagonal."""
+        xp = library(self.step)
+        squares: Square = xp.asarray(self.step)[..., :, None] ** 2 * np.eye(self.dimension)
+        return squares
+
+    @property
+    def dimension(self) -> int:
+        """Length of v."""
+        return self.source.dimension
+
+    def _with_error(self, variances: Vector) -> WeightedColumns:
+        """Return the columns of v, then those of independent rounding errors of these variances."""
+        return join_columns(self.source.columns, WeightedColumns(np.eye(self.dimension), variances))
+
+    def branches(self) -> GaussianBranches:
+        """Return the branches of v, each with the variance of e more."""
+        branches, error = self.source.branches(), LARGEST[self.dither].error * self.step**2
+        return branches._replace(variance=branches.variance + error[:, None])
+
+    def without_outliers(self) -> NoiseWithoutOutliers:
+        """Return v without its outliers, and e."""
+        plain = self.source.without_outliers()
+        return plain._replace(covariance=plain.covariance + LARGEST[self.dither].error * self._squares())
+
+    def report(self, y: jax.Array) -> jax.Array:
+        """Return the step nearest to each component of y."""
+        low = jnp.asarray(self.centre) - jnp.asarray(self.half)
+        return low + jnp.asarray(self.step) * jnp.floor((y - low) / jnp.asarray(self.step) + 0.5)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw v - centre: the rounding is the sensor's or the encoder's."""
+        return self.source.sample(key) - jnp.asarray(self.centre)
+
+    def moment(self, powers: Exponents) -> Number:
+        """Refuse moments above the second, which depend on the signal.
+
+        Raises:
+            ValueError: a third or higher moment.
+        """
+        if sum(powers) > 2:
+            raise fail("noise of a rounded measurement", "a filter of means and covariances (linear_filter)", "another")
+        places = [i for i, power in enumerate(powers) for _ in range(power)]
+        mean = [self.mean[i] for i in places]
+        if len(places) < 2:
+            return mean[0] if mean else 1.0
+        return mean[0] * mean[1] + self.covariance[places[0], places[1]]
+
+
+def find_rounded_noises(*models: PyTree) -> Sequence[RoundedNoise]:
+    """Return the noises of rounded measurements in these models."""
+    leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, RoundedNoise))
+    return [leaf for leaf in leaves if isinstance(leaf, RoundedNoise)]
+
+
+def round_without_dither(noise: AbstractNoise, resolution: Float[np.ndarray, " m"]) -> RoundedNoise:
+    """Return the noise of a sensor that reports multiples of its resolution."""
+    zero = np.zeros(noise.dimension)
+    return RoundedNoise(noise, resolution, zero, zero, "none")

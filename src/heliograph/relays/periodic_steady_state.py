@@ -1,0 +1,322 @@
+"""The periodic steady state of a relay network, slots in turn for ever, and gains tuned for it by descent."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.linear.jump_system import make_matrix_on_triangle_entries, propagate_by_mode, solve_fixed_point
+from heliograph.model.over_time import steps_covered
+from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.relays.design import (
+    GainsByFilter,
+    ReceiverViewOfRelays,
+    RelayDesign,
+    initial_error_covariance,
+    join_gains,
+    make_design,
+    make_receiver_view,
+    relay_gains,
+    split_gains,
+)
+from heliograph.relays.error_moments import PropagatedMoments, correct_moments, propagate_error_moments, regression_gain
+from heliograph.relays.power_limited_descent import Cost, make_penalised_cost, minimise_over_gains
+
+CONVERGED = 1e-13  # relative change of the moments over a period
+PERIODS = 100_000
+GAINS_CONVERGED = 1e-9  # the same for a covariance that only gives gains: their error enters it squared
+INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
+
+RepeatedPeriods = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
+
+
+def periodic_steps(network: RelayNetwork) -> RelaySteps:
+    """Return the steps of one period, at the stationary mean of the state.
+
+    Slots change links only, so the plant's step is that of the first slot, and the mean solves m = A m + b.
+
+    Raises:
+        ValueError: a network that varies beyond its slots, a plant that is not stable.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    if steps_covered(network) is not None:
+        raise fail("steady state", "a network that varies with its slots only", "parts that are OverTime")
+    steps = network.steps(len(network.slots))
+    radius = spectral_radius(steps.transition[0])
+    if radius >= 1:
+        raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
+    mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
+    steady_steps: RelaySteps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
+    return steady_steps
+
+
+def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
+    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
+
+    Args:
+        network: relays that filter, in slots that repeat.
+
+    Raises:
+        ValueError: what `periodic_steps` refuses, or moments that do not converge.
+    """
+    propagated, change = _iterate_local_design(periodic_steps(network), initial_error_covariance(network))
+    if not change <= CONVERGED:
+        raise fail("steady state", "moments that converge", f"a change of {float(change):.2g} after {PERIODS} periods")
+    return make_design(network, propagated)
+
+
+def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
+    """Return the steady state of a `network` under given gains, one entry per slot: {filter: (slots, n, received)}.
+
+    The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
+
+    Args:
+        network: relays that filter, in slots that repeat.
+        gains: K by filter, (slots, n, received).
+
+    Raises:
+        ValueError: gains of the wrong shape, or gains under which the second moments diverge.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    joined = join_gains(network, gains)
+    return make_design(network, _steady(_make_converging_steps(network, joined), joined))
+
+
+def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
+    """Return the steady error covariance of the best linear receiver behind given relays, at the end of each slot.
+
+    Args:
+        network: the network, which varies with its slots only.
+        gains: relay gains by name (slots, n, received).
+
+    Raises:
+        ValueError: gains of the wrong shape, or gains under which the second moments diverge.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    joined, n = relay_gains(network, gains), len(network.states)
+    return np.asarray(_steady_behind(_make_converging_steps(network, joined), joined))[:, :n, :n]
+
+
+def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
+    """Return the steps of one period, checked for gains under which the second moments converge."""
+    check_gains_of_slots(network, gains)
+    steps = periodic_steps(network)
+    radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
+    if not radius < 1:
+        raise fail("periodic gains", "second moments that converge", f"growth by {radius:.4g} per period")
+    return steps
+
+
+def check_gains_of_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> None:
+    """Raise ValueError where there is not one gain for each slot."""
+    if len(gains) != len(network.slots):
+        raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
+
+
+def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
+    """Return M = step(M) for an affine map of symmetric (d, d) matrices."""
+    constant, linear = jax.linearize(step, jnp.zeros((d, d)))
+    return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
+
+
+def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> PropagatedMoments:
+    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
+    d = gains.shape[1] + steps.transition.shape[-1]
+    start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
+    return propagate_error_moments(steps, start, gains)
+
+
+def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
+    """Decide whether all moments are positive semidefinite to rounding: the fixed point is then the limit."""
+    fixed = jax.lax.stop_gradient(moments)
+    smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
+    return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
+
+
+def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
+    """Return the steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
+
+    They are those at the end of each slot of a period. The receiver's gains are held while differentiating: they
+    minimise the error, so their change has no first-order effect, and the fixed point with given gains is affine.
+
+    Args:
+        steps: of one period.
+        gains: of all filters as one block matrix for each slot; those of the receiver are not used.
+    """
+    moments = steady_moments(steps, gains).moments[:-1]
+    sides = jax.vmap(make_receiver_view)(steps, moments, gains)
+    d = sides.transition.shape[-1]
+
+    def predict(covariance: jax.Array, side: ReceiverViewOfRelays) -> jax.Array:
+        """Return the covariance of (x, e_relays) and z after a slot, before the correction."""
+        both = jnp.concatenate([side.transition, side.output])
+        return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
+
+    def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
+        """Take one Riccati step: return the covariance after a slot, and the best gain."""
+        joint = predict(covariance, side)
+        gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
+        return correct_moments(joint, gain), gain
+
+    def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
+        side, gain = row
+        corrected = correct_moments(predict(covariance, side), gain)
+        return corrected, corrected
+
+    # The receiver's steady gains: its Riccati recursion over periods, without derivatives.
+    constant_sides = jax.lax.stop_gradient(sides)
+
+    def run_best_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the covariance at the end of a period, and the best gain of each of its slots."""
+        return jax.lax.scan(correct_best, covariance, constant_sides)
+
+    start = jax.lax.stop_gradient(moments[0][:d, :d])
+    steady_start, _ = _repeat_until_steady(lambda e: run_best_period(e)[0], start, GAINS_CONVERGED)
+    best_gains = jax.lax.stop_gradient(run_best_period(steady_start)[1])
+
+    # With these gains the fixed point is one linear solve.
+    def run_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the covariances at the end of a period, and of each of its slots."""
+        return jax.lax.scan(correct_with, covariance, (sides, best_gains))
+
+    _, covariances = run_period(affine_fixed_point(lambda e: run_period(e)[0], d))
+    return jnp.asarray(covariances)
+
+
+_steady = compile_in_float64(steady_moments)
+_steady_behind = compile_in_float64(steady_receiver_covariance)
+
+
+@compile_in_float64
+def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
+    """Return the linear part of the map of second moments over one period, a matrix on their entries."""
+    d = gains.shape[1] + steps.transition.shape[-1]
+    _, linear = jax.linearize(lambda m: propagate_error_moments(steps, m, gains).moments[-1], jnp.zeros((d, d)))
+    return jnp.asarray(make_matrix_on_triangle_entries(jax.vmap(linear), (d, d)))
+
+
+@compile_in_float64
+def _iterate_local_design(
+    steps: RelaySteps, start: Float[Array, "d d"]
+) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
+    """Repeat the period of the local design until its moments change by less than CONVERGED.
+
+    Returns gains, moments and power over the last period, and the last relative change of the moments.
+    """
+    moments, change = _repeat_until_steady(
+        lambda m: propagate_error_moments(steps, m).moments[-1], jnp.asarray(start), CONVERGED
+    )
+    return propagate_error_moments(steps, moments), change
+
+
+def _repeat_until_steady(
+    period: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: float
+) -> tuple[jax.Array, jax.Array]:
+    """Repeat a period until its relative change is below `tolerance`; return the last value and its change."""
+
+    def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
+        """Return the value after one more period, its relative change, and the count of periods."""
+        value, _, count = carry
+        after = period(value)
+        size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
+        return after, jnp.max(jnp.abs(after - value)) / size, count + 1
+
+    def changes(carry: RepeatedPeriods) -> jax.Array:
+        """Return whether the last change is above the tolerance, and periods are left."""
+        _, change, count = carry
+        return (change > tolerance) & (count < PERIODS)
+
+    value, change, _ = jax.lax.while_loop(changes, repeat, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))
+    return value, change
+
+
+def periodic_receiver_error_design(
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
+) -> RelayDesign:
+    """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
+
+    Descent through the fixed point of the second moments; the result is a local minimum.
+
+    Args:
+        network: the network, which varies with its slots only.
+        start: gains to begin with, {filter: (slots, n, received)}; the steady `local_error_design` unless given.
+        power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
+
+    Raises:
+        ValueError: what `periodic_steps` refuses, a start of the wrong shape or under which the moments diverge, a
+            limit that no gains were found to meet.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    design = periodic_local_error_design(network)
+    gains = join_gains(network, design.gains if start is None else start)
+    free = np.ones(gains.shape[-1], dtype=bool)
+    tuned = _tune_gains(network, gains, free, _receiver_cost, power_limit)
+    return periodic_given_design(network, split_gains(network, tuned))
+
+
+def periodic_relays_for_best_receiver(
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
+) -> dict[str, Float[np.ndarray, "slots n _"]]:
+    """Design relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
+
+    Args:
+        network: the network, which varies with its slots only.
+        start: relay gains to begin with, {relay: (slots, n, received)}; the steady `local_error_design` unless given.
+        power_limit: bound on the power that all relays send in each slot, a number or (slots,); none unless given.
+
+    Returns:
+        Gains by relay (slots, n, received); the receiver is `periodic_behind_relays`.
+
+    Raises:
+        ValueError: as for `periodic_receiver_error_design`; no relays.
+    """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    gains = relay_gains(network, periodic_local_error_design(network).gains if start is None else start)
+    # The receiver, whose received numbers are the last, is the best one whatever the relays do: its gains are not free.
+    received = gains.shape[-1]
+    free = np.arange(received) < received - network.received[-1]
+    tuned = split_gains(network, _tune_gains(network, gains, free, _best_receiver_cost, power_limit))
+    return {name: gain for name, gain in tuned.items() if name != RECEIVER}
+
+
+def _tune_gains(
+    network: RelayNetwork,
+    start: Float[np.ndarray, "slots Fn R"],
+    free: Bool[np.ndarray, "R"],
+    cost: Cost,
+    power_limit: ArrayLike | None,
+) -> Float[np.ndarray, "slots Fn R"]:
+    """Return the gains of least cost near `start`, checked to be one for each slot."""
+    steps = periodic_steps(network)
+    check_gains_of_slots(network, start)
+    return minimise_over_gains(network, steps, start, free, cost, power_limit)
+
+
+def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers."""
+    steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
+    # The moments begin with those before the first slot. The receiver's error is the last part of what they are of.
+    receiver = steady.moments[1:, -n:, -n:]
+    relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
+    return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
+
+
+def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers."""
+    steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
+    covariance = steady_receiver_covariance(steps, gains)
+    # The receiver's own part of the moments is left out: its gains among `gains` are not used.
+    sound = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
+    relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
+    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), sound, relay_powers
+
+
+_receiver_cost = make_penalised_cost(_trace_receiver_errors)
+_best_receiver_cost = make_penalised_cost(_trace_best_receiver_errors)

@@ -1,0 +1,170 @@
+"""Descent over the gains of a relay network's period, with the power of each slot kept below a limit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.relays import RelayNetwork, RelaySteps
+from heliograph.numerics.check import fail, repeat_per_step
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.relays.bfgs import bfgs
+from heliograph.relays.design import join_gains, split_gains
+from heliograph.relays.error_moments import gain_mask
+
+POWER_TOLERANCE = 1e-6  # relative excess over a limit that counts as met
+MARGIN = 1e-5  # the search aims this much below a limit, so that what is left of the multipliers' error does not matter
+ROUNDS = 10  # of the multipliers
+STIFFNESS = 1000.0  # of the augmented Lagrangian, against a cost that is a logarithm
+
+# value, gradient and power of gains base + x unit at `where`, from x, steps, base, where, unit, limit, multipliers
+Cost = Callable[[Array, RelaySteps, Array, tuple[Array, ...], Array, Array, Array], tuple[Array, Array, Array]]
+
+
+def minimise_over_gains(
+    network: RelayNetwork,
+    steps: RelaySteps,
+    start: Float[np.ndarray, "slots Fn R"],
+    free: Bool[np.ndarray, "R"],
+    cost: Cost,
+    power_limit: ArrayLike | None,
+) -> Float[np.ndarray, "slots Fn R"]:
+    """Return the gains of least cost, by descent over the entries that multiply `free` received numbers.
+
+    A limit of power is kept by an augmented Lagrangian: with g_s = power_s / limit_s - 1 in slot s the cost is that of
+    `_penalise_power`, and after each descent lambda_s = max(0, lambda_s + STIFFNESS g_s).
+
+    Args:
+        network: the relay network.
+        steps: those of one period.
+        start: gains of all filters with which the descent begins, one block matrix for each slot of the period.
+        free: which of the received numbers have gains that may change.
+        cost: the penalised cost of gains (`make_penalised_cost`).
+        power_limit: of all relays together in each slot; None for no limit.
+
+    Raises:
+        ValueError: gains at the start under which moments diverge; a limit that no gains were found to meet.
+    """
+    # The entries that may change; the variables x are their changes in units of their filter's largest entry.
+    where = np.nonzero(gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0) & free)
+    unit = _find_largest_entries(network, start)[where]
+    # A limit for each slot, without effect where no relay transmits. The search aims a margin below it.
+    slots = len(network.slots)
+    limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
+    limit = np.where(steps.transmits_in_slot[:, 1:].any(axis=1), limit, np.inf)
+    aimed_limit = limit * (1 - MARGIN)
+    # lambda, a multiplier for the power of each slot.
+    multipliers, x = np.zeros(slots), np.zeros(len(unit))
+    start_cost, _gradient, _power = cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)
+    if not np.isfinite(start_cost):
+        raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
+    # Descend, then raise the multipliers of slots above their limit; once where there is no limit.
+    for _ in range(ROUNDS if power_limit is not None else 1):
+        x = _descend(cost, x, (steps, start, where, unit, aimed_limit, multipliers))
+        _cost, _gradient, powers = cost(x, steps, start, where, unit, limit, multipliers)
+        power = np.asarray(powers)
+        excess = power / aimed_limit - 1
+        if _are_within_limits(excess, multipliers):
+            break
+        multipliers = np.maximum(0.0, multipliers + STIFFNESS * excess)
+    if np.any(power > limit * (1 + POWER_TOLERANCE)):
+        raise fail("power limit", "one that some gains meet", f"an excess of {np.max(power / limit) - 1:.2g}")
+    tuned: np.ndarray = start.copy()
+    tuned[where] += x * unit
+    return tuned
+
+
+def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
+    """Return the x of least cost, found by descent from x; `arguments` are those of the cost behind x."""
+
+    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the cost of x, and its gradient."""
+        value, gradient, _power = cost(x, *arguments)
+        return float(value), np.asarray(gradient)
+
+    return bfgs(evaluate, x)
+
+
+def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
+    """Return whether no slot is above its limit, and those with a multiplier are at it; `excess`: power / limit - 1."""
+    return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
+
+
+def _find_largest_entries(
+    network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]
+) -> Float[np.ndarray, "slots Fn R"]:
+    """Return the largest entry of each filter's gain in each slot, at every entry of that gain."""
+    largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
+    # Of a filter whose gains are small or zero in a slot, a thousandth of the largest of all.
+    floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
+    return join_gains(
+        network,
+        {
+            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), size))
+            for (name, value), size in zip(largest.items(), network.received, strict=True)
+        },
+    )
+
+
+def _penalise_power(
+    traces: Float[jax.Array, "slots"],
+    sound: Bool[jax.Array, ""],
+    power: Float[jax.Array, "slots"],
+    limit: Float[Array, "slots"],
+    multipliers: Float[Array, "slots"],
+) -> Float[jax.Array, ""]:
+    """Return log sum_s trace_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, g = power / limit - 1, c the STIFFNESS.
+
+    Infinite where the moments are not `sound`, so that a search turns back.
+    """
+    total = jnp.sum(traces)
+    sound = sound & (total > 0)
+    pressure = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
+    penalty = jnp.sum(pressure**2) / (2 * STIFFNESS)
+    return jnp.where(sound, jnp.log(jnp.where(sound, total, 1.0)) + penalty, jnp.inf)
+
+
+def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
+    """Return a compiled function that gives a period's gains their cost, its gradient, and the power of each slot.
+
+    The cost is log sum_s tr P_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, the augmented Lagrangian of power limits
+    g_s = power_s / limit_s - 1 <= 0 over the slots s of a period; infinite where the moments do not converge.
+
+    Args:
+        traces: `traces(steps, gains)` returns tr P_s of each slot (slots,), whether the moments converge, and the power
+            of each slot (slots,).
+    """
+
+    def evaluate(
+        x: Array,
+        steps: RelaySteps,
+        base: Array,
+        where: tuple[Array, ...],
+        unit: Array,
+        limit: Array,
+        multipliers: Array,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the penalised cost of gains, its gradient by x (n,), and the slots' powers (slots,).
+
+        Args:
+            x: changes of the n free entries of the gains (n,), in units of `unit`.
+            steps: steps of a period.
+            base: gains that x changes (slots, F n, R).
+            where: places of the free entries in them, one array of indices (n,) for each axis.
+            unit: size of each free entry (n,).
+            limit: greatest power of each slot (slots,).
+            multipliers: lambda_s (slots,).
+        """
+
+        def compute_cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return the penalised cost, and beside it the powers."""
+            trace, converges, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
+            return _penalise_power(trace, converges, power, limit, multipliers), power
+
+        (cost, power), gradient = jax.value_and_grad(compute_cost_and_power, has_aux=True)(x)
+        return cost, gradient, power
+
+    return compile_in_float64(evaluate)

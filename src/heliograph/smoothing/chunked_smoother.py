@@ -1,0 +1,171 @@
+"""Smoothing of a long recording in chunks of rows side by side: a filter forgets how it began and how it will end.
+
+A chunk is filtered from the state with which it begins (`heliograph.filters.chunks`) over its own rows and as many
+behind them as are forgotten, and passed through backwards from the filtered state there. Of the state between two
+chunks, that by which one of them was entered backwards and the one with which the later one was left have to agree;
+else the earlier one is smoothed again from the latter. What a step leaves for the way back stays in the lanes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import choose_code
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.chunks import (
+    ChunkStarts,
+    find_chunk_starts,
+    replace_chunk,
+    rescan_wrong_starts,
+    scan_means_where_settled,
+)
+from heliograph.filters.recursion import linear_start, scan_chunk
+from heliograph.filters.settled_covariance import SettledState
+from heliograph.filters.smoother_step import SmootherStep, gaussian_of
+from heliograph.filters.states import find_equal_states, select_state
+from heliograph.filters.windows import Which, take, take_windows
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.smoothing.fixed_interval_lag_point import sum_nis_over_blocks
+from heliograph.smoothing.steady_covariance_smoothing import SmoothedChunk, SmootherStepRecursion, smooth_settled_chunks
+
+
+class SmoothedRows(NamedTuple):
+    """Smoothed estimates of all rows, and sums over blocks of their squared innovations, as `nis_sums` returns them."""
+
+    estimate: Estimate
+    sums: Float[np.ndarray, "5"]
+
+
+def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
+    """Smooth rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
+
+    Args:
+        filter: the filter, which can be smoothed.
+        z: measurements (rows, received), NaN for what did not arrive.
+        u: inputs (rows, inputs).
+    """
+    start, rows = linear_start(filter), (np.asarray(z), np.asarray(u))
+    if start is None:
+        return None
+    with jax.enable_x64(True):
+        begun = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
+        return None if begun is None else _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
+
+
+def smooth_chunk(
+    recursion: SmootherStepRecursion,
+    state: PyTree,
+    rows: PyTree,
+    first: Array,
+    end: Array,
+    later: Gaussian,
+    is_given: Array,
+) -> SmoothedChunk:
+    """Smooth a chunk's own rows by all data up to row `end`: filter ahead, then pass back.
+
+    Args:
+        recursion: the filter over rows, and how many rows are the chunk's own.
+        state: the filter's state at the chunk's beginning.
+        rows: measurements and inputs of its own rows and of those behind them.
+        first: number of its first row.
+        end: number of the row before which the pass back begins; rows from it on are not used.
+        later: the smoothed law with which the pass back begins, if it `is_given`; else it is the filter's there.
+        is_given: whether `later` is used.
+    """
+    own = recursion.own
+    state_after, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
+    last_state, steps_behind = scan_chunk(recursion, state_after, take(rows, slice(own, None)), first + own, end)
+
+    def pass_back(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, None]:
+        """Return the law before a row from that behind it; the same from row `end` on."""
+        step, k = item
+        return select_state(k < end, step.back(law), law), None
+
+    def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
+        """Return the law before a row, and the row's smoothed estimate."""
+        step, _k = item
+        law_before, _ = pass_back(law, item)
+        return law_before, step.estimate_from(law)
+
+    k = first + jnp.arange(len(rows[0]))
+    law = select_state(is_given, later, gaussian_of(last_state))
+    entered, _ = jax.lax.scan(pass_back, law, (steps_behind, k[own:]), reverse=True)
+    left, estimate = jax.lax.scan(pass_back_and_estimate, entered, (steps, k[:own]), reverse=True)
+    return SmoothedChunk(
+        end=state_after, entered=entered, left=left, estimate=estimate, nis=steps.nis, received=steps.received
+    )
+
+
+SmoothChunks = Callable[..., SmoothedChunk | None]  # of states, which chunks, and the laws behind them, if given
+
+
+def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
+    """Smooth all chunks side by side, and again those that a neighbour contradicts; None without native code.
+
+    A chunk has `own` rows, of which it smooths the estimates, and a window of these and the `ahead` rows behind them.
+    It filters its window and passes back from the window's end, where it begins with the filtered law instead of the
+    smoothed one. Over the `ahead` rows that is forgotten, so it enters its own rows with the law that all later data
+    give.
+    """
+    total, (own, ahead) = len(rows[0]), begun.lengths
+    windows = take_windows(rows, begun.first, own + ahead)
+    window_ends = np.minimum(begun.first + own + ahead, total)
+
+    def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
+        """Smooth the chunks `which`, filtered from these states; None without native code.
+
+        They pass back from the end of their windows; or, with `later`, from the end of their own rows, where `later` is
+        the smoothed law.
+        """
+        first = begun.first[which]
+        is_given = np.full(len(first), later is not None)
+        if later is None:
+            pass_back_from, laws = window_ends[which], gaussian_of(states)  # these laws are not used
+        else:
+            pass_back_from, laws = first + own, later
+        arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
+        differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
+        choice = choose_code(smooth_chunk, arguments, differs_by_chunk)
+        return None if choice.code is None else choice.results()
+
+    def smooth_means(settled: SettledState) -> SmoothedChunk | None:
+        """Smooth all chunks as if they were settled."""
+        return smooth_settled_chunks(recursion, settled, begun, windows)
+
+    # Means alone are computed of chunks in which covariances stand still: that takes a window in which everything
+    # arrived, and which does not reach beyond the last row.
+    is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
+    begun = begun._replace(covered=begun.covered & is_complete)
+    results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
+    if results is None:
+        return None
+    # Repaired in place: from the first chunk on, those that began in another state than that in which the one before
+    # them ends; then from the last one back, those that a later chunk contradicts.
+    rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
+    _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
+    parts = results.estimate, results.nis, results.received  # (chunks, own, ...) each
+    estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], parts)
+    return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
+
+
+def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: SmoothedChunk) -> None:
+    """Smooth again, in place, each chunk entered by another law than that with which the next one was left.
+
+    The last such chunk comes first: smoothed again from the next one's law, it is left by another law itself, with
+    which the chunk before it has to agree. A chunk begins in the state in which the one before it ends, the first one
+    in that of `states`.
+    """
+    wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
+    for c in range(len(wrong) - 1, -1, -1):
+        if not wrong[c]:
+            continue
+        before, here, behind = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
+        state = take(results.end, before) if c else take(states, here)
+        replace_chunk(results, here, smooth(state, here, take(results.left, behind)))
+        if c:
+            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, here))
+            wrong[c - 1] = not agrees

@@ -1,0 +1,175 @@
+"""Passes of a smoother: the filter ahead, which collects a smoother step of each row, and back over these steps.
+
+Back from the end of a run (fixed interval), back over each lag, or ahead with one state (fixed point).
+"""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.filter_data import check_data
+from heliograph.filters.smoother_step import EarlierState, SmootherStep
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import check_count, instance
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+T = TypeVar("T")
+
+
+def smoother_steps(
+    filter: "AbstractFilter",
+    measurements: Float[ArrayLike, "steps received"],
+    inputs: Float[ArrayLike, "steps inputs"] | None = None,
+    state: PyTree | None = None,
+    first_step: int = 0,
+) -> "tuple[PyTree, SmootherStep]":
+    """Step a filter over rows of data; return its state after them, and its smoother steps stacked along time.
+
+    Args:
+        filter: a filter that can be smoothed.
+        measurements: rows (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+        state: state before the first row; the filter's initial state by default.
+        first_step: number of the first row's step; 0 by default.
+
+    Raises:
+        ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    z, u = check_data(filter, measurements, inputs)
+    first = np.asarray(check_count("first step", first_step, 0))
+    return filter_rows_with_smoother_steps(filter, z, u, filter.init() if state is None else state, first)
+
+
+@compile_on_call
+def filter_rows_with_smoother_steps(
+    filter: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
+) -> tuple[PyTree, SmootherStep]:
+    """Run a filter over rows of data; return its state after them, and the smoother step of each row, compiled.
+
+    As `smoother_steps`, of arrays that are checked, from `state` before the row of step `first`.
+    """
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
+        return filter.step_with_smoother(state, *row)
+
+    rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
+    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
+
+
+def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
+    """Return the filter planned for these inputs and complete data, with its smoother steps but for their means."""
+    planned = filter.planned(inputs)
+    if planned is filter:
+        return filter
+    return planned.with_past(data_free_smoother_steps(filter, inputs))
+
+
+def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
+    """Return the smoother steps for z = 0, of a filter whose covariances and gains depend on no data.
+
+    Their covariances and gains are those of all data; their means stand in for those that data will give.
+    """
+    zeros = jnp.zeros((len(inputs), filter.received))
+    steps: SmootherStep = filter_rows_with_smoother_steps(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
+    return steps
+
+
+def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
+    """Estimate each step's state given all data: one backward pass."""
+
+    def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
+        """Smooth the state between two steps, given the smoothed one after both."""
+        previous, step = pair
+        law = step.back(later)
+        return law, previous.estimate_from(law)
+
+    # From the last step, whose smoothed state is the filtered one.
+    last = take_step(steps, -1)
+    _, earlier = jax.lax.scan(body, last.end, _pair_with_next(steps), reverse=True)
+    return _append_last(earlier, last.estimate_from(last.end))
+
+
+def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
+    """Estimate the mean of each step's state given all data: one backward pass."""
+
+    def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
+        """Smooth the mean between two steps, given the smoothed one after both."""
+        previous, step = pair
+        mean = step.mean_back(later)
+        return mean, _take_plant_mean(previous, mean)
+
+    last = take_step(steps, -1)
+    end = jnp.asarray(last.mean)
+    _, earlier = jax.lax.scan(body, end, _pair_with_next(steps), reverse=True)
+    return _append_last(earlier, _take_plant_mean(last, end))
+
+
+def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate:
+    """Estimate each step's state given up to `lag` later steps: as many short backward passes, in parallel."""
+    last = len(steps.mean) - 1
+    times = jnp.arange(last + 1)
+
+    def pass_one_step_back(done: jax.Array, later: Gaussian) -> Gaussian:
+        """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
+        ahead = times + lag - done
+        before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
+        passed: Gaussian = jax.tree.map(
+            lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), before, later
+        )
+        return passed
+
+    # From the newest step that each one may use, as many steps back as the lag has.
+    newest = take_steps(steps.end, jnp.minimum(times + lag, last))
+    smoothed = jax.lax.fori_loop(0, lag, pass_one_step_back, newest)
+    estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(steps, smoothed)
+    return estimate
+
+
+def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
+    """Estimate the state after one step given the data up to it, and up to each later one."""
+    start = take_step(steps, step)
+
+    def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
+        """Carry the state after `step` over a later one, and estimate it given the data up to there."""
+        after = later_step.ahead(point)
+        return after, start.estimate_from(start.settle(later_step.reached(after)))
+
+    _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
+    whole: Estimate = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]), start.estimate_from(start.after), later
+    )
+    return whole
+
+
+def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
+    """Return the mean of the plant's state for this mean of the filter's."""
+    return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
+
+
+def _pair_with_next(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
+    """Pair each step with the one after it."""
+    return take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None))
+
+
+def _append_last(rows: T, last: T) -> T:
+    """Append the last step's value to those of the steps before."""
+    whole: T = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, last)
+    return whole
+
+
+def take_step(steps: T, k: int) -> T:
+    """Take step k of what is stacked along time."""
+    step: T = jax.tree.map(lambda leaf: leaf[k], steps)
+    return step
+
+
+def take_steps(steps: T, which: slice | jax.Array) -> T:
+    """Take some steps of what is stacked along time."""
+    chosen: T = jax.tree.map(lambda leaf: leaf[which], steps)
+    return chosen

@@ -1,0 +1,358 @@
+"""Simplification of scalar operations as they are made: constants are computed, x + 0 is x, -(-x) is x.
+
+A product with zero is zero only if the other factor is known to be finite: data may be NaN. In a product of matrices a
+known zero leaves its term out (`rules/matrices.py`).
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from straightline.nodes import REAL, Node, Number, Type
+
+COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
+DTYPES: dict[str, Any] = {
+    "f64": np.float64,
+    "f32": np.float32,
+    "bool": np.bool_,
+    "i32": np.int32,
+    "i64": np.int64,
+    "u32": np.uint32,
+    "u64": np.uint64,
+}
+
+
+class NodeMaker(Protocol):
+    """A program that makes nodes; `never_nan` are those that are known not to be NaN."""
+
+    never_nan: set[Node]
+
+    def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
+        """Return the node of an operation."""
+
+    def constant(self, value: Number, type: Type) -> Node:
+        """Return the node of a constant."""
+
+
+def wrap_integer(number: int, like: Any) -> Any:
+    """Return the integer of a type that has the lowest bits of a number."""
+    kind = type(like)
+    bits = 8 * like.itemsize
+    rest = number % (1 << bits)
+    return kind(rest - (1 << bits) if rest > np.iinfo(kind).max else rest)
+
+
+def _shift_left(a: Any, b: Any) -> Any:
+    """Return a << b; 0 where b is no number of bits of the type."""
+    return wrap_integer(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
+
+
+def _shift_right(a: Any, b: Any) -> Any:
+    """Return a >> b with zeros from the left; 0 where b is no number of bits of the type."""
+    bits = 8 * a.itemsize
+    return wrap_integer(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
+
+
+def _shift_right_signed(a: Any, b: Any) -> Any:
+    """Return a >> b with copies of the highest bit from the left, also of an unsigned a; all copies for a large b."""
+    last = 8 * a.itemsize - 1
+    is_negative = int(a) >> last == 1  # an unsigned number whose highest bit is set is read as one below zero
+    signed = int(a) - (1 << last + 1) if is_negative else int(a)
+    return wrap_integer(signed >> (int(b) if 0 <= b <= last else last), a)
+
+
+def _divide(a: Any, b: Any) -> Any:
+    """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
+    if isinstance(a, np.floating):
+        return np.divide(a, b)
+    return wrap_integer(_divide_toward_zero(int(a), int(b)) if b else -1, a)
+
+
+def _remainder(a: Any, b: Any) -> Any:
+    """Return what is left of a division, with the sign of a; of integers by 0 all."""
+    if isinstance(a, np.floating):
+        return np.fmod(a, b)
+    return wrap_integer(int(a) - _divide_toward_zero(int(a), int(b)) * int(b) if b else int(a), a)
+
+
+def _divide_toward_zero(a: int, b: int) -> int:
+    """Return a / b rounded toward zero."""
+    return abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
+
+
+def _maximum(a: Any, b: Any) -> Any:
+    """Return the larger number, 0 of two zeros unless both are -0; NaN if either is."""
+    return a + b if a == b == 0 and isinstance(a, np.floating) else np.maximum(a, b)
+
+
+def _minimum(a: Any, b: Any) -> Any:
+    """Return the smaller number, -0 of two zeros unless both are 0; NaN if either is."""
+    return -_maximum(-a, -b) if isinstance(a, np.floating) else np.minimum(a, b)
+
+
+def _sign(a: Any) -> Any:
+    """Return 1 or -1 by the sign; a zero as it is."""
+    return a if a == 0 else np.sign(a)
+
+
+def _round_away(a: Any) -> Any:
+    """Return the nearest whole number, of halves the one further from zero."""
+    whole = np.trunc(a)
+    return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
+    try:
+        return type(a)(math.pow(a, b))
+    except (ValueError, OverflowError):
+        return np.power(a, b)
+
+
+def _convert_number(a: Any, kind: Any) -> Any:
+    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
+        return a.astype(kind)
+    ends = np.iinfo(kind)
+    return kind(0 if np.isnan(a) else ends.max if a >= ends.max else ends.min if a <= ends.min else int(a))
+
+
+# Operations whose numbers of known numbers are computed here; others wait for the run.
+EVALUATED: dict[str, Callable[..., Any]] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divide, "rem": _remainder, "neg": np.negative,
+    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "log1p": np.log1p, "expm1": np.expm1,
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": _power,
+    "round_even": np.rint, "round_away": _round_away,
+    "floor": np.floor, "ceil": np.ceil, "sign": _sign, "is_finite": np.isfinite,
+    "max": _maximum, "min": _minimum,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert,
+    "shift_left": _shift_left, "shift_right": _shift_right,
+    "shift_right_signed": _shift_right_signed,
+}  # fmt: skip
+
+
+def fold_node(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    """Return an existing or simpler node of the same value; None if there is none."""
+    for a in args:
+        if a.op != "constant":
+            rule = SIMPLER.get(op)
+            return None if rule is None else rule(graph, type, *args)
+    return _evaluate(graph, op, type, args)
+
+
+# The same of doubles, as Python computes them in a tenth of the time: of a matrix's known zeros there are millions.
+OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul,
+}  # fmt: skip
+
+
+def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    """Return the constant that an operation on constants gives, or None for one that is not folded."""
+    if type == "f64" and op in OF_DOUBLES:
+        return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
+    numbers = [DTYPES[a.type](a.value) for a in args]
+    with np.errstate(all="ignore"):
+        if op == "select":
+            return args[1] if numbers[0] else args[2]
+        if op == "convert":
+            value = _convert_number(numbers[0], DTYPES[type])
+        elif op == "bitcast":
+            value = numbers[0].view(DTYPES[type])
+        elif op in EVALUATED:
+            value = EVALUATED[op](*numbers)
+        else:
+            return None
+    return graph.constant(value.item(), type)
+
+
+def _is_constant(node: Node, number: float) -> bool:
+    """Return whether a node is the constant of this number."""
+    return bool(node.op == "constant" and node.value == number)
+
+
+def is_finite(node: Node) -> bool:
+    """Return whether a number is finite whatever the data."""
+    if node.type not in REAL or (node.op == "constant" and math.isfinite(node.value)):
+        return True
+    if node.op == "convert":
+        return node.args[0].type not in REAL
+    return node.op == "select" and all(is_finite(a) for a in node.args[1:])
+
+
+def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a + b: x + 0 = x, a + (-x) = a - x; None where nothing is simpler."""
+    if a.op == "constant" and a.value == 0:
+        return b
+    if b.op == "constant" and b.value == 0:
+        return a
+    if type in REAL and b.op == "neg":
+        return graph.node("sub", type, a, b.args[0])
+    if type in REAL and a.op == "neg":
+        return graph.node("sub", type, b, a.args[0])
+    return None
+
+
+def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a - b: x - 0 = x, -0 - x = -x, a - (-x) = a + x; None where nothing is simpler."""
+    if _is_constant(b, 0):
+        return a
+    if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
+        return graph.node("neg", type, b)
+    if type in REAL and b.op == "neg":
+        return graph.node("add", type, a, b.args[0])
+    return None
+
+
+def _fold_mul(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a b: 1 x = x, 0 x = 0 of a finite x, -1 x = -x, (x + x) / 2 = x; None where nothing is simpler."""
+    if b.op == "constant":
+        a, b = b, a
+    if a.op != "constant":
+        return None
+    if a.value == 1:
+        return b
+    if a.value == 0 and is_finite(b):
+        return a
+    if type in REAL and a.value == -1:
+        return graph.node("neg", type, b)
+    if a.value == 0.5 and b.op == "add" and b.args[0] is b.args[1]:
+        return b.args[0]
+    # c (-x) = (-c) x. Not of c = 0: which zero comes out is left to the run.
+    if a.value == 0 or b.op != "neg":
+        return None
+    return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
+
+
+def _fold_div(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Replace a division by a power of two by the product with its reciprocal, which is exact."""
+    if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
+        return None
+    # A power of two has the mantissa 1/2; both it and its reciprocal must be normal numbers.
+    largest = 1e300 if type == "f64" else 1e37
+    if abs(math.frexp(b.value)[0]) != 0.5 or not 1 / largest < abs(b.value) < largest:
+        return None
+    return graph.node("mul", type, a, graph.constant(1 / b.value, type))
+
+
+def _fold_neg(graph: NodeMaker, type: Type, a: Node) -> Node | None:
+    """Simplify -(-x) to x."""
+    return a.args[0] if a.op == "neg" else None
+
+
+def _fold_and(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a & b where one is a constant flag or both are the same; None where nothing is simpler."""
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return b if a.value else a
+    return a if a is b else None
+
+
+def _fold_or(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a | b where one is a constant or both are the same; None where nothing is simpler."""
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return a if a.value else b
+    if a.op == "constant" and a.value == 0:
+        return b
+    return a if a is b else None
+
+
+def _fold_xor(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a ^ b where one is zero, or a constant flag; None where nothing is simpler."""
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and not a.value:
+        return b
+    return graph.node("not", type, b) if a.op == "constant" and type == "bool" else None
+
+
+def _fold_not(graph: NodeMaker, type: Type, a: Node) -> Node | None:
+    """Simplify not not x to x."""
+    return a.args[0] if a.op == "not" else None
+
+
+def _fold_shift(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify a shift by no bits."""
+    return a if _is_constant(b, 0) else None
+
+
+def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+    """Simplify max(x, x) and min(x, x) to x."""
+    return a if a is b else None
+
+
+def _fold_select(graph: NodeMaker, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+    """Simplify a choice by a condition known, negated, or that of an inner choice; None where nothing is simpler."""
+    if a is b:
+        return a
+    if condition.op == "constant":
+        return a if condition.value else b
+    if condition.op == "not":
+        return graph.node("select", type, condition.args[0], b, a)
+    if a.op == "select" and a.args[0] is condition:
+        return graph.node("select", type, condition, a.args[1], b)
+    if b.op == "select" and b.args[0] is condition:
+        return graph.node("select", type, condition, a, b.args[2])
+    if type == "bool" and a.op == "constant" and b.op == "constant":
+        return condition if a.value else graph.node("not", "bool", condition)
+    return None
+
+
+def _make_equality_rule(op: str) -> Callable[..., Node | None]:
+    """Return the rule that simplifies == or !=."""
+
+    def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+        """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
+        if a is b and (a.type not in REAL or a in graph.never_nan or is_finite(a)):
+            return graph.constant(op == "eq", "bool")
+        if a.op == "constant":
+            a, b = b, a
+        if b.op != "constant":
+            return None
+        flag = a.args[0] if a.op == "convert" and a.args[0].type == "bool" else a
+        if flag.type != "bool" or b.value not in (0, 1):
+            return None
+        return flag if bool(b.value) == (op == "eq") else graph.node("not", "bool", flag)
+
+    return fold_flag_comparison
+
+
+def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | None]:
+    """Return the rule that writes an order of flags as logic; `strict`: < rather than <=, `turned`: > for <."""
+
+    def fold_flag_order(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
+        """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
+        if a.type != "bool":
+            return None
+        # low < high is "not low and high", low <= high is "not low or high".
+        low, high = (b, a) if turned else (a, b)
+        return graph.node("and" if strict else "or", "bool", graph.node("not", "bool", low), high)
+
+    return fold_flag_order
+
+
+def _fold_convert(graph: NodeMaker, type: Type, a: Node) -> Node | None:
+    """Simplify a conversion: of the same type, there and back, or to a flag (x != 0); None where nothing is simpler."""
+    if a.type == type:
+        return a
+    if type == "f32" and a.op == "convert" and a.args[0].type == "f32" and a.type == "f64":  # nothing was lost
+        return a.args[0]
+    if type == "bool":
+        return graph.node("ne", "bool", a, graph.constant(0.0 if a.type in REAL else 0, a.type))
+    return None
+
+
+SIMPLER: dict[str, Callable[..., Node | None]] = {
+    "add": _fold_add, "sub": _fold_sub, "mul": _fold_mul, "div": _fold_div, "neg": _fold_neg,
+    "and": _fold_and, "or": _fold_or, "xor": _fold_xor, "not": _fold_not, "select": _fold_select,
+    "shift_left": _fold_shift, "shift_right": _fold_shift, "max": _fold_extremum, "min": _fold_extremum,
+    "eq": _make_equality_rule("eq"), "ne": _make_equality_rule("ne"), "convert": _fold_convert,
+    "lt": _make_flag_order_rule(True, False), "le": _make_flag_order_rule(False, False),
+    "gt": _make_flag_order_rule(True, True), "ge": _make_flag_order_rule(False, True),
+}  # fmt: skip

@@ -1,0 +1,168 @@
+"""What of a program differs between runs, and where its numbers lie in memory."""
+
+from collections import Counter
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
+
+from straightline.llvm.function_writer import count_turns, list_loops_around
+from straightline.llvm.operations import BITS
+from straightline.nodes import REAL, Buffer, Node, Unsupported
+from straightline.program import Program, SummedOutputs, find_differing_items, list_used_nodes
+from straightline.vectors.elementary_functions import FUNCTIONS
+
+LINE = 64  # bytes: where vectors of any width may start
+WIDEST = 8  # runs of a vector of doubles: one register of the widest processors, two of others; more only spill
+LONG = 60  # operations of an elementary function or of a hash: 30 to 150, and 80
+FILLED = ("scratch", "carried")  # kinds of memory that the program fills
+
+
+class ProgramParts(NamedTuple):
+    """Items of a program in order, and what of them differs between runs: `spread`; all else is computed once.
+
+    `lanes` are the inputs that differ: a block of runs has one run's numbers in each lane of its vectors. `alone`:
+    there is one run, whose arrays are used in place. A vector has at most `width` runs.
+    """
+
+    program: Program
+    items: list[Any]
+    outputs: list[Buffer]
+    lanes: list[Buffer]
+    spread: set[Any]
+    alone: bool
+    width: int
+    summed: SummedOutputs | None
+
+    @property
+    def tables(self) -> list[Buffer]:
+        """Return the tables of constants that the items read."""
+        return [x for x in self.items if isinstance(x, Buffer) and x.kind == "table"]
+
+    @property
+    def passed_buffers(self) -> list[Buffer]:
+        """Return the buffers whose addresses a caller passes."""
+        return [*self.program.inputs, *self.tables, *self.outputs]
+
+    @property
+    def common(self) -> list[bool]:
+        """Return which outputs all runs share."""
+        return [b not in self.spread for b in self.outputs]
+
+    @property
+    def outputs_summed_in_memory(self) -> list[Buffer]:
+        """Return the outputs that are summed over runs."""
+        if self.summed is None:
+            return []
+        pairs = zip(self.outputs, self.summed.outputs, strict=True)
+        return [b for b, is_sum in pairs if is_sum and b in self.spread]
+
+
+def split_shared_from_differing(
+    program: Program,
+    items: list[Any],
+    outputs: list[Buffer],
+    differing: Iterable[bool],
+    width: int | None,
+    alone: bool,
+    summed: SummedOutputs | None,
+) -> ProgramParts:
+    """Return the parts of a program for its two functions, of what differs between runs and of what they share.
+
+    Args:
+        program: the program of one run.
+        items: all that the outputs need, in order.
+        outputs: a buffer for each result.
+        differing: for each input whether it differs between runs.
+        width: the most runs of a vector; as many as suit the program if None.
+        alone: whether there is one run, whose arrays are used in place.
+        summed: outputs that are summed over runs.
+    """
+    lanes = [b for b, differs in zip(program.inputs, differing, strict=True) if differs or alone]
+    # What differs between runs. One run alone computes all in the function of blocks, so all counts as differing; but
+    # tables are constants, which never do.
+    spread = {*items, *program.inputs} if alone else find_differing_items(items, lanes)
+    spread = {x for x in spread if not (isinstance(x, Buffer) and x.kind == "table")}
+    return ProgramParts(
+        program=program,
+        items=items,
+        outputs=outputs,
+        lanes=lanes,
+        spread=spread,
+        alone=alone,
+        width=width or choose_vector_width(spread),
+        summed=summed,
+    )
+
+
+def choose_vector_width(items: Iterable[Any]) -> int:
+    """Return the most runs of a vector: twice as many where most of what is computed has 32 bits, not 64.
+
+    A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
+    operations on doubles, takes 12 ns a particle with 16 runs and 19 with 8; among 281 it takes 15 and 31.
+    """
+    counts = Counter[int]()
+    for x in items:
+        if isinstance(x, Node):
+            bits = 32 if x.op == "threefry" else BITS[x.type]
+            counts[bits] += LONG if x.op == "threefry" or x.op in FUNCTIONS else 1
+    return 2 * WIDEST if counts[32] > counts[64] else WIDEST
+
+
+class MemoryLayout(NamedTuple):
+    """Offsets of buffers, and their ends, in bytes: of memory that belongs to a thread, and that all runs share.
+
+    `turning` are shared buffers within loops that have a place for each turn.
+    """
+
+    scratch: int
+    in_scratch: dict[Buffer, int]
+    shared: int
+    in_shared: dict[Buffer, int]
+    turning: set[Buffer]
+
+
+def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
+    """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
+
+    `mine` are the items of the function of blocks. What it reads of memory that is filled anew in each turn of a loop
+    has a place for each turn.
+    """
+    owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
+    added = set(parts.outputs_summed_in_memory)
+    _check_sums(parts.items, added)
+    used_in_place = {*parts.outputs, *parts.lanes} if parts.alone else set()
+    own = [b for b in owners if b in parts.spread and b not in added and b not in used_in_place]
+    common = [b for b in owners if b not in parts.spread and b.kind in FILLED]
+    turning = {b for b in common if list_loops_around(b.block)}
+    turning &= _find_read_buffers(mine) if turning else turning
+    scratch, in_scratch = _place_buffers(own, parts.width)
+    shared, in_shared = _place_buffers(common, 1, turning)
+    return MemoryLayout(scratch=scratch, in_scratch=in_scratch, shared=shared, in_shared=in_shared, turning=turning)
+
+
+def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
+    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
+    read = _find_read_buffers(items) if outputs else set()
+    if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
+        raise Unsupported("a sum over runs of numbers that are used again")
+
+
+def _find_read_buffers(items: Iterable[Any]) -> set[Buffer]:
+    """Return the buffers that these items, or what they use directly, load numbers of."""
+    nodes = (node for x in items for node in (x, *list_used_nodes(x)) if isinstance(node, Node))
+    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
+
+
+def _place_buffers(
+    buffers: Iterable[Buffer], width: int, turning: Collection[Buffer] = ()
+) -> tuple[int, dict[Buffer, int]]:
+    """Place buffers of `width` runs one after another; return the end and each one's offset, in bytes.
+
+    Those in `turning` have a copy for each turn of the loops around them.
+    """
+    start, places = 0, dict[Buffer, int]()
+    for buffer in buffers:
+        places[buffer] = start
+        copies = count_turns(buffer.block) if buffer in turning else 1
+        # Up to the next cache line: -(-a // b) is a / b rounded up.
+        start += -(-buffer.size * copies * width * BITS[buffer.type] // 8 // LINE) * LINE
+    return start, places

@@ -1,0 +1,82 @@
+"""Text of LLVM IR that depends on the number of lanes W, or on the machine: types <W x T>, gathers, subnormals."""
+
+import platform
+from functools import cache
+
+from straightline.llvm.transposition import TextLines
+
+
+@cache
+def write_vector_types(width: int) -> str:
+    """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
+    vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "float", "i64", "i32", "i8", "i1")]
+    return "".join([*vectors, f"%lanes = type i{width}\n"])
+
+
+# W as a number: the size of a vector of bytes.
+WIDTH = "ptrtoint (ptr getelementptr (%i8, ptr null, i64 1) to i64)"
+
+
+def write_lane_numbers(width: int) -> str:
+    """Write `%i64 @hg_lanes()`: 0, 1, ... W - 1."""
+    numbers = ", ".join(f"i64 {lane}" for lane in range(width))
+    return f"define internal %i64 @hg_lanes() noinline nounwind {{\n  ret %i64 <{numbers}>\n}}\n"
+
+
+def gather_name(bits: int, spread: bool) -> str:
+    """Return the name of a gather."""
+    return f"hg_gather{bits}_{'lanes' if spread else 'table'}"
+
+
+def write_gather(bits: int, spread: bool, width: int) -> str:
+    """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, which loads in each lane the number at its place.
+
+    If `spread`, a place has a number for each lane, of which each lane loads its own.
+    """
+    # The vector is put together lane by lane, from one of which no number is set ("poison").
+    vector, text, gathered = f"%i{bits}", TextLines(), "poison"
+    row = f"[{width} x i{bits}]" if spread else f"i{bits}"
+    for lane in range(width):
+        index = text.add(f"extractelement %i64 %places, i64 {lane}")
+        in_row = f", i64 {lane}" if spread else ""
+        address = text.add(f"getelementptr {row}, ptr %start, i64 {index}{in_row}")
+        number = text.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+        gathered = text.add(f"insertelement {vector} {gathered}, i{bits} {number}, i64 {lane}")
+    head = f"define internal {vector} @{gather_name(bits, spread)}(ptr %start, %i64 %places) noinline nounwind"
+    body = "\n".join(text.lines)
+    return f"{head} {{\n{body}\n  ret {vector} {gathered}\n}}\n"
+
+
+FLUSH = 0x8040  # of the control word of x86: results and arguments that are subnormal are zeros
+X86 = ("x86_64", "amd64", "i386", "i686")
+
+
+def write_subnormal_flush(width: int) -> str:
+    """Return the LLVM text of two functions, `i32 @hg_flush()` and `void @hg_restore(i32)`.
+
+    After the first, the processor takes subnormal numbers for zeros; it returns the processor's former state, which the
+    second restores. An operation on subnormal numbers takes x86 a hundred times as long, and in single precision they
+    are not rare, from 1e-38 down; XLA's code takes them for zeros too. Other processors take no longer for them: there
+    both functions do nothing. The width is not used.
+    """
+    if platform.machine().lower() not in X86:
+        flush, restore = "  ret i32 0\n", "  ret void\n"
+    else:
+        flush = f"""  %place = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %place)
+  %before = load i32, ptr %place
+  %after = or i32 %before, {FLUSH}
+  store i32 %after, ptr %place
+  call void @llvm.x86.sse.ldmxcsr(ptr %place)
+  ret i32 %before
+"""
+        restore = """  %place = alloca i32
+  store i32 %before, ptr %place
+  call void @llvm.x86.sse.ldmxcsr(ptr %place)
+  ret void
+"""
+    return f"""define internal i32 @hg_flush() noinline nounwind {{
+{flush}}}
+define internal void @hg_restore(i32 %before) noinline nounwind {{
+{restore}}}
+"""

@@ -1,0 +1,167 @@
+"""Machine code from text of LLVM IR: generated in haste first, and again with care once it is executed often."""
+
+import ctypes
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from threading import Lock, current_thread, main_thread
+
+import jax
+import llvmlite.binding as llvm
+
+from straightline.llvm.module_text import FunctionSource
+from straightline.lowering import turn_failures_into_refusals, warn_once
+from straightline.nodes import Unsupported
+from straightline.size_limits import OFTEN
+
+Function = Callable[[int, int, int, int, int], None]
+SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+
+
+@cache
+def find_llvm_target() -> llvm.Target:
+    """Return the LLVM target of this machine.
+
+    Raises:
+        Unsupported: LLVM does not know its processor, which is said once.
+    """
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    try:
+        return llvm.Target.from_default_triple()
+    except RuntimeError as error:
+        warn_once(f"no native code: expected a processor that LLVM knows, got {error}")
+        raise Unsupported("LLVM does not know this processor") from None
+
+
+@cache
+def find_processor_features() -> tuple[str, str, bool]:
+    """Return this processor's name and features for LLVM, and whether it has fused multiply-add."""
+    flags = llvm.get_host_cpu_features()
+    arm = "aarch64" in find_llvm_target().triple or "arm64" in find_llvm_target().triple
+    return llvm.get_host_cpu_name(), flags.flatten(), bool(flags.get("fma")) or arm
+
+
+class MachineCode:
+    """Machine code of one text of LLVM IR; its function `run` may be called as long as this object exists.
+
+    LLVM's optimisation passes find nothing more in straight lines, and would take as long as the generation of code.
+    `level` is that of the generation: 0 in haste, 1 with registers assigned with care; `width` is the count of runs of
+    a vector. Results have the same bits whatever both are.
+    """
+
+    def __init__(self, source: FunctionSource, level: int, width: int):
+        """Generate code of a text for vectors of `width` runs, at LLVM's level 0 (in haste) or 1 (with care)."""
+        self.level, self.width = level, width
+        cpu, flags, *_ = find_processor_features()
+        machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
+        module = llvm.parse_assembly(source.text(width))
+        module.verify()
+        code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
+        module.close()  # three times the memory of its code
+        # An engine that generates the code itself would verify the module again.
+        self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        self.engine.add_object_file(code)
+        self.engine.finalize_object()
+        self.run: Function = SIGNATURE(self.engine.get_function_address("run"))
+
+
+def choose_hasty_width(width: int) -> int:
+    """Return the runs of one register where `width` are those of one of the widest: for code in haste, sooner made so.
+
+    LLVM splits what does not fit one register: selections and comparisons of event filters take it three times as long.
+    """
+    return width if "+avx512f" in find_processor_features()[1].split(",") else width // 2
+
+
+@cache
+def get_careful_thread() -> ThreadPoolExecutor:
+    """Return the thread that generates code with care while that in haste is executed."""
+    return ThreadPoolExecutor(1)
+
+
+@cache
+def _get_hasty_thread() -> ThreadPoolExecutor:
+    """Return the thread that generates code for which the main thread waits."""
+    return ThreadPoolExecutor(1)
+
+
+@turn_failures_into_refusals("a program")
+def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
+    """Generate code outside of the main thread, and wait for it.
+
+    Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
+    there could change its owner and nobody note it, and be freed twice.
+
+    Raises:
+        Unsupported: LLVM makes no code of it, which is said once.
+    """
+    if current_thread() is not main_thread():
+        return MachineCode(source, level, width)
+    return _get_hasty_thread().submit(MachineCode, source, level, width).result()
+
+
+def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) -> MachineCode:
+    """Generate code with care; if that fails, that in haste goes on, and it is said once."""
+    try:
+        return MachineCode(source, 1, width)
+    except Exception as error:
+        warn_once(
+            f"native code: generated with care it failed ({type(error).__name__}: {error}); that in haste goes on"
+        )
+        return hasty
+
+
+class TieredCode:
+    """Code of one text, generated again with care when its executions have cost as much as that.
+
+    A call that executes a program `often` waits for care; any other goes on in haste until care is done in the
+    background. Both have the same results, bit for bit, so that nothing but time depends on earlier calls. `widths` are
+    the runs of a vector in haste and with care.
+    """
+
+    def __init__(self, source: FunctionSource, widths: tuple[int, int]):
+        """Begin without code; `widths`: runs of a vector of code in haste, and of code made with care."""
+        self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
+        self._machine: MachineCode | None = None
+        self._careful: Future[MachineCode] | None = None
+
+    def generate_code(self, blocks: float) -> None:
+        """Generate code for a first execution for so many blocks, if there is none."""
+        with self._lock:
+            self._make_first(self._executions + self._count_executions(blocks))
+
+    def choose_machine(self, blocks: float) -> MachineCode:
+        """Return code that is about to be executed for so many blocks of the most runs; hold it while it runs."""
+        made = self._machine
+        if made is not None and made.level:  # nothing better is to come
+            return made
+        with self._lock:
+            executions = self._count_executions(blocks)
+            self._executions += executions
+            machine = self._make_first(self._executions)
+            # In haste so far, but care pays by now. (The level is asked for last: JAX takes 30 us to say its setting.)
+            if not machine.level and self._choose_level(self._executions):
+                self._careful = self._careful or get_careful_thread().submit(
+                    _generate_with_care, self._source, self._widths[1], machine
+                )
+                # A call that is long enough waits for it; others go on in haste until it is done.
+                if executions >= OFTEN or self._careful.done():
+                    self._machine = machine = self._careful.result()
+            return machine
+
+    def _make_first(self, executions: float) -> MachineCode:
+        """Return the code that is made at the first call, at a level for so many executions."""
+        if self._machine is None:
+            level = self._choose_level(executions)
+            self._machine = emit_code(self._source, level, self._widths[level])
+        return self._machine
+
+    def _count_executions(self, blocks: float) -> float:
+        """Return the executions of each operation, on average, for so many blocks."""
+        return blocks * self._source.work / max(self._source.operations, 1)
+
+    def _choose_level(self, executions: float) -> int:
+        """Return 1, with care, if that pays for so many executions and JAX's setting allows it, else 0, in haste."""
+        pays = executions >= OFTEN
+        return int(pays and not jax.config.values["jax_disable_most_optimizations"])

@@ -1,0 +1,160 @@
+"""Rules of inner programs: called functions, and branches, known to be taken or selected in each run.
+
+An expensive branch is computed only if some run takes it (a guarded block).
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, arrange_nodes
+from straightline.nodes import Block, Guard, Node, RandomKey
+from straightline.rules.elementwise import select
+from straightline.rules.loops import estimate_size
+from straightline.size_limits import DEAR
+
+CALLS = (
+    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "checkpoint", "remat", "remat2",
+)  # fmt: skip
+
+
+def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline the function of a call (jit, custom_jvp, ...)."""
+    params = equation.params
+    inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
+    return lowering.inline_program(inner, inputs)
+
+
+def _inline_custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a function that has a rule of its own for `vmap`."""
+    return lowering.inline_program(equation.params["call"], inputs)
+
+
+def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
+    primitive = equation.params["_prim"]
+
+    def expand(*leaves: jax.Array) -> list[jax.Array]:
+        """Return the leaves of the operation's results, computed by its definition."""
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
+
+    avals: list[Any] = [v.aval for v in equation.invars]
+    struct: Any = jax.ShapeDtypeStruct
+    program = jax.make_jaxpr(expand)(*(struct(a.shape, a.dtype) for a in avals))
+    return lowering.inline_program(program, inputs)
+
+
+def _select_platform(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Select the branch of a program for CPUs."""
+    platforms = equation.params["platforms"]
+    number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
+    return [lowering.make_known_array(np.int32(number))]
+
+
+IN_MEMORY |= dict.fromkeys(CALLS, _inline_call)
+IN_MEMORY |= {"custom_vmap_call": _inline_custom_vmap_call, "call_hi_primitive": _expand_call}
+RULES |= {"platform_index": _select_platform}
+
+
+def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower `cond`: a branch by a constant, else all branches, large ones skipped where no lane takes them."""
+    branches = equation.params["branches"]
+    which = lowering.get_only_node(inputs[0])
+    if which.op == "constant":
+        taken = min(max(int(which.value), 0), len(branches) - 1)
+        return lowering.inline_program(branches[taken], inputs[1:])
+    if len(branches) == 1:
+        return lowering.inline_program(branches[0], inputs[1:])
+    # Small branches are computed in any case, large ones in guarded blocks. The smallest is first, so that larger ones
+    # use what it computed: what a guarded block computes is not there outside of it.
+    conditions = _find_taken_branches(lowering, which, len(branches))
+    sizes = [estimate_size(lowering, branch.jaxpr) for branch in branches]
+    results: dict[int, list[np.ndarray]] = {}
+    for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
+        results[k] = _lower_branch(lowering, conditions[k], branches[k], inputs[1:])
+    # Select the results of the branch that is taken.
+    chosen = results[len(branches) - 1]
+    for k in reversed(range(len(branches) - 1)):
+        chosen = [_select_arrays(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
+    return chosen
+
+
+def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[Node]:
+    """Return for each branch whether it is taken; indices out of range select the first or last.
+
+    `which` is the index, or a flag, by itself or as an integer, that chooses among two.
+    """
+    graph = lowering.graph
+    if which.op == "convert" and which.args[0].type == "bool":
+        which = which.args[0]
+    if which.type == "bool":
+        return [graph.node("not", "bool", which), which]
+    # Branch k is taken if the index is at most k, but not at most k - 1.
+    limit_new_nodes = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [
+        graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(limit_new_nodes)
+    ]
+    return [limit_new_nodes[0], *between, graph.node("not", "bool", limit_new_nodes[-1])]
+
+
+def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
+    """Compute a branch in the open block if it has few nodes, else in a guarded one."""
+    graph, outer = lowering.graph, lowering.graph.current
+    graph.current = block = Block(outer, pinned=True)
+    try:
+        results = [lowering.nodes(x) for x in lowering.inline_program(branch, inputs)]
+    finally:
+        graph.current = outer
+    # How many nodes it has is known only now that it is lowered.
+    if _count_block_nodes(block) <= DEAR:
+        _move_statements_out(block, outer)
+        return results
+    guard = Guard(block, condition)
+    outer.items.append(guard)
+    return [
+        arrange_nodes([_read_guarded_result(lowering, guard, x) for x in r.ravel().tolist()], r.shape) for r in results
+    ]
+
+
+def _read_guarded_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
+    """Return a number of a guarded block as seen from outside of it: zero where the block is skipped."""
+    if isinstance(value, RandomKey):
+        return RandomKey(
+            _read_guarded_result(lowering, guard, value.first), _read_guarded_result(lowering, guard, value.second)
+        )
+    if value.block is not guard.body:
+        return value
+    if value in guard.values:
+        return guard.results[guard.values.index(value)]
+    guarded = lowering.graph.make_fresh_node(
+        "guarded", value.type, (), lowering.graph.current, (guard, len(guard.values))
+    )
+    guard.values.append(value)
+    guard.results.append(guarded)
+    return guarded
+
+
+def _count_block_nodes(block: Block) -> int:
+    """Count the nodes of a block; a statement in it counts as many."""
+    return sum(1 if isinstance(statement, Node) else DEAR + 1 for statement in block.items)
+
+
+def _move_statements_out(block: Block, outer: Block) -> None:
+    """Move the statements of a block into the one around it."""
+    for statement in block.items:
+        statement.block = outer  # type: ignore[union-attr]
+    outer.items += block.items
+    outer.seen |= block.seen
+
+
+def _select_arrays(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return array a where the condition, one for all entries, holds, else b."""
+    pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
+    return arrange_nodes([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
+
+
+IN_MEMORY |= {"cond": _lower_cond}

@@ -1,0 +1,187 @@
+"""Operations of one's own: a plain function of JAX, which native code computes by another function in its place."""
+
+from collections.abc import Callable, Sequence
+from functools import cache, partial, wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+from straightline.lowering import IN_MEMORY, Lowering, Value, make_placeholder
+from straightline.nodes import Unsupported
+from straightline.size_limits import MANY_TERMS
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+Axes = tuple[int | None, ...]  # of each argument: 0 where `vmap` maps its first axis, None where all share it
+
+_primitive: Any = Primitive("operation")
+_primitive.multiple_results = True
+
+
+class _OperationProgram(NamedTuple):
+    """One operation on arguments of one shape: its plain function as traced, and what native code computes instead."""
+
+    name: str
+    plain: ClosedJaxpr
+    native: Callable[..., list[Any]]  # of leaves, as `plain`
+    x64: bool  # whether JAX's numbers were double where it was traced
+
+    def __hash__(self) -> int:
+        return id(self.plain)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _OperationProgram) and self.plain is other.plain
+
+    def __repr__(self) -> str:
+        return self.name  # by which the texts of two programs differ
+
+
+def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a function, here called the plain one, for which native code and C compute another one, `native`.
+
+    The two are the same function in two forms: all entries side by side, which suits XLA, and a straight line of
+    operations, which suits native code. XLA compiles, `vmap` maps and JAX differentiates the plain one. Native code
+    computes `native`, on one item after another where `vmap` maps them, or the plain one where `native` is too long.
+
+    Args:
+        native: a function of the same arguments with the same results.
+
+    Returns:
+        The decorator of the plain function, whose arguments are trees of arrays.
+    """
+
+    def decorate(plain: Callable[P, R]) -> Callable[P, R]:
+        """Return the function as one operation of a program, whose native rule is `native`."""
+
+        @cache
+        def trace_plain_function(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_OperationProgram, Any]:
+            """Trace the plain function for arguments of these shapes and types; return it and its results' tree.
+
+            `x64`: whether JAX's numbers are double now, on which the trace depends.
+            """
+            result_tree: list[Any] = []  # filled while it is traced
+
+            def call_on_leaves(function: Callable[..., R], *leaves: Any) -> list[Any]:
+                """Return the leaves of the function's results from those of its arguments; note the results' tree."""
+                args, kwargs = jax.tree.unflatten(tree, leaves)
+                results, structure = jax.tree.flatten(function(*args, **kwargs))
+                result_tree[:] = [structure]
+                return results
+
+            traced = jax.make_jaxpr(partial(call_on_leaves, plain))(*(make_placeholder(*kind) for kind in kinds))
+            name = f"{plain.__module__}.{plain.__qualname__}"
+            return _OperationProgram(name, traced, partial(call_on_leaves, native), x64), result_tree[0]
+
+        @wraps(plain)
+        def call_as_operation(*args: P.args, **kwargs: P.kwargs) -> R:
+            """Trace the function once for these shapes, then bind it as one primitive, which `vmap` and others see."""
+            leaves, tree = jax.tree.flatten((args, kwargs))
+            leaves = [jnp.asarray(leaf) for leaf in leaves]
+            kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+            is_x64 = bool(jnp.result_type(float) == np.float64)
+            program, result_tree = trace_plain_function(tree, kinds, is_x64)
+            flat = _primitive.bind(*leaves, program=program, levels=(), sizes=())  # under no vmap yet
+            results: R = jax.tree.unflatten(result_tree, flat)
+            return results
+
+        return call_as_operation
+
+    return decorate
+
+
+def _apply_plain(
+    *leaves: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
+) -> list[Any]:
+    """Compute the plain function, not the native one, under its levels of `vmap`, the innermost first.
+
+    `sizes` is a parameter of the primitive only.
+    """
+    function = jaxpr_as_fun(program.plain)
+    for axes in levels:
+        function = jax.vmap(function, in_axes=axes)
+    return list(function(*leaves))
+
+
+def _find_result_shapes(
+    *_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
+) -> list[Any]:
+    """Return shapes and types of the results: those of the plain function, behind an axis for each level of vmap."""
+    return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
+
+
+def _batch_operation(
+    leaves: Sequence[Any], axes: Sequence[int | None], *, program: _OperationProgram, levels: tuple[Axes, ...],
+    sizes: tuple[int, ...],
+) -> tuple[list[Any], list[int]]:  # fmt: skip
+    """Add a level of `vmap`, whose axis becomes the first one."""
+    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, axes, strict=True)]
+    level = tuple(None if axis is None else 0 for axis in axes)
+    size = next(x.shape[0] for x, axis in zip(moved, level, strict=True) if axis == 0)
+    results = _primitive.bind(*moved, program=program, levels=(*levels, level), sizes=(size, *sizes))
+    return results, [0] * len(results)
+
+
+def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
+    """Return the plain function's results and their tangents, by the arguments that have tangents."""
+    has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+
+    def call(*varying: Any) -> list[Any]:
+        """Call the plain function with these in place of the arguments that have tangents."""
+        rest = iter(varying)
+        return _apply_plain(*(next(rest) if has else x for has, x in zip(has_tangent, primals, strict=True)), **params)
+
+    values = [x for has, x in zip(has_tangent, primals, strict=True) if has]
+    directions = [x for has, x in zip(has_tangent, tangents, strict=True) if has]
+    results, slopes = jax.jvp(call, values, directions)
+    return results, slopes
+
+
+def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Inline the native function; the plain one where native code does not take that, or it has too many operations.
+
+    Known zeros of the arguments decide how many it has: so it is tried.
+    """
+    program: _OperationProgram = equation.params["program"]
+    try:
+        with lowering.graph.limit_new_nodes(MANY_TERMS):
+            return lowering.inline_program(_trace_in_loops(lowering, equation, program.native), inputs)
+    except Unsupported:
+        return lowering.inline_program(_trace_in_loops(lowering, equation, jaxpr_as_fun(program.plain)), inputs)
+
+
+def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
+    """Trace a function of one item, once for equal shapes, in a loop over each level of `vmap`."""
+    program, levels = equation.params["program"], equation.params["levels"]
+    kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
+    key = program, function is program.native, levels, kinds
+    if key not in lowering.kernels:
+        for axes in levels:
+            function = partial(_apply_one_by_one, function, axes)
+        with jax.enable_x64(program.x64):
+            lowering.kernels[key] = jax.make_jaxpr(function)(*(make_placeholder(*kind) for kind in kinds))
+    return lowering.kernels[key]
+
+
+def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
+    """Apply a function to one entry of a batch after another; `axes`: 0 for leaves that have a batch, else None."""
+
+    def call(entries: list[Any]) -> list[Any]:
+        """Call the function for one entry of each leaf that has a batch."""
+        rest = iter(entries)
+        return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))
+
+    results: list[Any] = jax.lax.map(call, [x for x, axis in zip(leaves, axes, strict=True) if axis == 0])
+    return results
+
+
+_primitive.def_impl(jax.jit(_apply_plain, static_argnames=("program", "levels", "sizes")))
+_primitive.def_abstract_eval(_find_result_shapes)
+batching.primitive_batchers[_primitive] = _batch_operation
+ad.primitive_jvps[_primitive] = _differentiate
+mlir.register_lowering(_primitive, mlir.lower_fun(_apply_plain, multiple_results=True))
+IN_MEMORY["operation"] = _apply_native

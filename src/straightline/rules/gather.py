@@ -1,0 +1,155 @@
+"""Rule of gather at known places, or at places that data select."""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+from jax.lax import GatherDimensionNumbers
+
+from straightline.lowering import RULES, Lowering, known_integers
+from straightline.nodes import Unsupported
+from straightline.rules.elementwise import select
+from straightline.rules.index_bounds import (
+    clamp_place,
+    convert_to_32_bits,
+    fills_outside,
+    find_window_places,
+    is_inside,
+    make_fill_value,
+)
+from straightline.rules.loops import put_in_memory
+from straightline.rules.shapes import select_array
+from straightline.size_limits import FEW
+from straightline.strided_arrays import contiguous_strides
+
+
+def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Gather windows at clipped indices; where the mode fills, a window that is not inside is filled with a value."""
+    x, indices = inputs
+    if not fills_outside(equation):
+        return [_gather_clipped(equation, lowering, x, indices)]
+    indices = convert_to_32_bits(lowering, indices)
+    flags, missing = _is_inside(lowering, equation, x.shape, indices), make_fill_value(lowering, equation)
+    gathered, numbers = _gather_clipped(equation, lowering, x, indices), equation.params["dimension_numbers"]
+    for entry in np.ndindex(*gathered.shape):
+        gathered[entry] = select(lowering.graph, flags[_find_index_row(entry, numbers)], gathered[entry], missing)
+    return [gathered]
+
+
+def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
+    """Return for each row of indices whether its window is inside an array of this shape."""
+    axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
+    flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
+    for row in np.ndindex(*flags.shape):
+        for axis, start in zip(axes, indices[row], strict=True):
+            here = is_inside(lowering.graph, start, shape[axis] - sizes[axis])
+            before: Any = flags[row]
+            flags[row] = lowering.graph.node("and", "bool", before, here)
+    return flags
+
+
+def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Gather at indices that are clipped to the array; where data decide them, all places are compared."""
+    known = known_integers(indices)
+    if known is None:
+        return _gather_by_cases(lowering, equation, x, indices)
+    sizes, numbers = tuple(equation.params["slice_sizes"]), equation.params["dimension_numbers"]
+    places = _find_gathered_places(x.shape, sizes, known.tobytes(), known.shape, numbers)
+    gathered: np.ndarray = x.ravel()[places.ravel()].reshape(places.shape)
+    return gathered
+
+
+@lru_cache(1000)
+def _find_gathered_places(
+    shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
+) -> np.ndarray:
+    """Return the places in the flat array that a gather takes at known indices: a filter has each a dozen times.
+
+    They have the axes of the indices, of shape `of`, then those of the window, moved to where the result has them.
+    """
+    known = np.frombuffer(indices, dtype=np.int64).reshape(of)
+    batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
+    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    places = find_window_places(shape, sizes, known, numbers.start_index_map, batching, removed, clips=True)
+    first = known.ndim - 1
+    return np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
+
+
+def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Gather at indices (..., axis) that depend on data: one gather for each possible value, then a selection.
+
+    Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[column]
+    last = x.shape[axis] - sizes[axis]
+    if last >= FEW:
+        return _gather_from_memory(lowering, equation, x, indices, column)
+    cases = [
+        _gather_clipped(equation, lowering, x, _replace_indices(lowering, indices, column, n)) for n in range(last + 1)
+    ]
+    selected = cases[-1].copy()
+    for entry in np.ndindex(*selected.shape):
+        which = indices[(*_find_index_row(entry, numbers), column)]
+        if which.op != "constant":  # where it is known, all cases are the same
+            entry_of_cases = [np.array(case[entry], dtype=object) for case in cases]
+            selected[entry] = select_array(lowering.graph, which, entry_of_cases)[()]
+    return selected
+
+
+def _gather_from_memory(
+    lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, column: int
+) -> np.ndarray:
+    """Gather from an array put in memory, where one index of each window depends on data and has many places.
+
+    Args:
+        lowering: the program.
+        equation: the gather.
+        x: nodes of the array.
+        indices: nodes of the windows' first places, (..., column).
+        column: the last axis of `indices` at which they depend on data; all other columns are known.
+
+    Returns:
+        The gathered nodes.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axis = numbers.start_index_map[column]
+    last_start = x.shape[axis] - sizes[axis]
+    # Where each gathered number would lie in the flat array if the index that depends on data were 0: what the same
+    # gather takes from an array of the places 0, 1, 2, ...
+    with_zero = _replace_indices(lowering, indices, column, 0)
+    if known_integers(with_zero) is None:
+        raise Unsupported("gather at two places that data decide")
+    places = np.arange(x.size, dtype=object).reshape(x.shape)
+    offsets = _gather_clipped(equation, lowering, places, with_zero)
+    # It lies behind that place by the index, clamped so that the window stays inside, times the stride of its axis.
+    buffer, stride = put_in_memory(lowering, x).buffer, contiguous_strides(x.shape)[axis]
+    loaded = np.empty(offsets.shape, dtype=object)
+    for entry in np.ndindex(*loaded.shape):
+        index = indices[(*_find_index_row(entry, numbers), column)]
+        if index.op == "constant":  # its place is right already, since `_replace_indices` keeps what is known
+            loaded[entry] = x.ravel()[offsets[entry]]
+        else:
+            clamped: Any = clamp_place(lowering, index, last_start)
+            loaded[entry] = lowering.graph.load(buffer, int(offsets[entry]), (stride,), (clamped,))
+    return loaded
+
+
+def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
+    """Replace the indices that depend on data by a number."""
+    replaced = indices.copy()
+    for row in np.ndindex(*indices.shape[:-1]):
+        node = indices[(*row, column)]
+        if node.op != "constant":
+            replaced[(*row, column)] = lowering.graph.constant(number, node.type)
+    return replaced
+
+
+def _find_index_row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
+    """Return the row of indices from which an entry of the result is gathered."""
+    return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+
+
+RULES |= {"gather": _gather}

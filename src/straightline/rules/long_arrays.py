@@ -1,0 +1,323 @@
+"""Rules of arithmetic on long arrays in memory: a loop over their rows.
+
+What `vmap` made of a step, for all rows of a record at once, becomes that step in a loop again.
+"""
+
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from straightline.graph import Graph
+from straightline.lowering import (
+    IN_MEMORY,
+    RULES,
+    Lowering,
+    Rule,
+    Value,
+    arrange_nodes,
+    make_placeholder,
+    result_shape,
+    result_type,
+)
+from straightline.nodes import Node, Type
+from straightline.rules.elementwise import ELEMENTWISE
+from straightline.rules.loops import Turn, put_in_memory, repeat_turns
+from straightline.rules.matrices import combine_nodes, write_product
+from straightline.size_limits import LOADED, MANY_TERMS, TABLE, WRITTEN_OUT
+from straightline.strided_arrays import StridedArray
+
+OF_ENTRIES = (
+    *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
+    "bitcast_convert_type", "round",
+)  # fmt: skip
+
+
+def is_long(inputs: list[Value]) -> bool:
+    """Return whether nodes for all entries of an argument would be too many.
+
+    More than LOADED numbers in memory always are. More than TABLE are, unless all arrays in memory are tables of
+    constants and the other arguments are as many nodes, or what is left to compute is known or, as in q I, of few
+    entries. Zeros stay structure then.
+    """
+    views = [x for x in inputs if isinstance(x, StridedArray)]
+    longest = max((x.size for x in views), default=0)
+    if not TABLE < longest <= LOADED:
+        return longest > TABLE
+    return not (all(map(_is_table, views)) and _are_written_out(inputs, longest))
+
+
+def _is_table(x: Value) -> bool:
+    """Return whether an array is a table of constants, at a place that is known."""
+    return isinstance(x, StridedArray) and x.buffer.kind == "table" and not x.moves
+
+
+def _are_written_out(inputs: list[Value], count: int) -> bool:
+    """Return whether a result of tables and other arrays is written out as nodes.
+
+    So it is where one of these is as many nodes already, where all are known, or where there are but single numbers
+    beside tables of few entries that are not zero.
+    """
+    arrays = [x for x in inputs if not isinstance(x, StridedArray)]
+    tables = [x for x in inputs if isinstance(x, StridedArray)]
+    are_known = all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
+    are_single = all(x.size == 1 for x in arrays)
+    are_sparse = all(np.count_nonzero(x.get_known_numbers()) <= TABLE for x in tables)
+    return are_known or any(x.size >= count for x in arrays) or (are_single and are_sparse)
+
+
+def _make_row_by_row_rule(name: str) -> Rule:
+    """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
+
+    def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Lower the operation on arrays of the result's shape, or of fewer axes, or of one row."""
+        shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
+        # Arguments with rows are read from memory; those that all rows share stay as they are.
+        items = [x if len(x.shape) < ndim or x.shape[0] == 1 else put_in_memory(lowering, x) for x in inputs]
+        row_equation = make_row_equation(equation)
+
+        def turn(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            """Return no carry, and the operation's result for one row."""
+            rows = [take_row_of_argument(lowering, x, row, ndim) for x in items]
+            return [], list(lowering.lower_equation(row_equation, rows))
+
+        return list(repeat_turns(lowering, shape[0], [], lambda p, c: load_as_nodes(lowering, turn(p, c)))[1])
+
+    return lower_row_by_row
+
+
+def load_as_nodes(
+    lowering: Lowering, results: tuple[list[Value], list[Value]]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the carried and the stacked arrays of a turn as nodes, loaded where they are in memory."""
+    carried, stacked = results
+    return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
+
+
+def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
+    """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
+    if x.ndim < ndim:
+        return x
+    if isinstance(x, StridedArray):
+        return x.row(0 if x.shape[0] == 1 else row)
+    return x[:1].reshape(x.shape[1:])
+
+
+def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
+    """Return the same operation for one row."""
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    rows = [SimpleNamespace(aval=make_placeholder(a.shape[1:], a.dtype)) for a in avals]
+    return SimpleNamespace(
+        primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
+        source_info=equation.source_info,
+    )  # fmt: skip
+
+
+def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Lower a product of arrays (JAX's `dot_general`): of short ones written out, of long ones row by row in a loop.
+
+    Written out are results of one number from arrays of which nodes may be loaded, short arrays, and products by a
+    known matrix whose zeros leave few terms.
+    """
+    to_number = not result_shape(equation) and all(x.size <= LOADED for x in inputs)
+    if to_number or not is_long(inputs):
+        return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    arrays = [x if _is_table(x) or x.size > LOADED else lowering.nodes(x) for x in inputs]
+    if (factors := _find_sparse_product(equation, arrays)) is not None:
+        return list(_write_out_product(lowering, equation, factors))
+    a, b = (put_in_memory(lowering, x) for x in inputs)
+    return _multiply_by_row(lowering, equation, a, b)
+
+
+def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b: StridedArray) -> list[Value]:
+    """Lower a product of arrays in memory as a loop.
+
+    As JAX calls them, batch axes are those of both arguments and of the result, contracted ones are summed over, and
+    free ones are of one argument and of the result. The loop is over the first batch axis, else over the first free
+    axis of a, else over that of b: each turn computes a row of the result. Where there is no such axis, the loop is
+    over the first contracted one, and turns are summed.
+    """
+    (a_contracted, b_contracted), (a_batch, b_batch) = equation.params["dimension_numbers"]
+    # The axis of each argument that is looped over, None where an argument is used whole in every turn.
+    if a_batch:
+        a_axis, b_axis = a_batch[0], b_batch[0]
+    else:
+        a_axis = _find_free_axis(a, a_contracted)
+        b_axis = _find_free_axis(b, b_contracted) if a_axis is None else None
+    is_summed = a_axis is None and b_axis is None
+    if is_summed:
+        (a_axis, *a_contracted), (b_axis, *b_contracted) = a_contracted, b_contracted
+    # The operation on one row: dimension numbers without the axis of the loop.
+    contracted = _renumber_axes(a_contracted, a_axis), _renumber_axes(b_contracted, b_axis)
+    batch = _renumber_axes(a_batch[1:], a_axis), _renumber_axes(b_batch[1:], b_axis)
+    row_equation = make_row_equation(equation, dimension_numbers=(contracted, batch))
+    by_row = [(x if axis is None else _move_to_front(x, axis), axis) for x, axis in ((a, a_axis), (b, b_axis))]
+
+    def multiply_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return no carry, and the product for one row."""
+        rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
+        return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
+
+    count = next(x.shape[0] for x, axis in by_row if axis is not None)
+    if is_summed:
+        return _accumulate_turns(lowering, equation, count, multiply_row)
+    _carry, stacked = repeat_turns(lowering, count, [], multiply_row)
+    return list(stacked)
+
+
+def _find_free_axis(x: StridedArray, contracted: Sequence[int]) -> int | None:
+    """Return the first axis that is not summed over; None if all are."""
+    return next((d for d in range(x.ndim) if d not in contracted), None)
+
+
+def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
+    """Return a product of arrays of nodes: written out, or of many terms by a loop over rows in memory."""
+    (left, right), (batch, _) = equation.params["dimension_numbers"]
+    if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
+        return write_product(lowering, equation, inputs)
+    return _dot_general(lowering, equation, [put_in_memory(lowering, x) for x in inputs])
+
+
+def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
+    """Count the terms of all sums over an axis of a and one of b, without those that a known zero leaves out."""
+    if a.size * b.size <= MANY_TERMS * a.shape[left]:  # few enough with all zeros: no need to count them
+        return 0
+    # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
+    return int(_count_nonzero_entries(a, left) @ _count_nonzero_entries(b, right))
+
+
+def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
+    """Count the entries that are no known zero, for each place along an axis."""
+    is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
+    counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
+    return counts
+
+
+def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: Turn) -> list[Value]:
+    """Return the sum over the `count` turns of a loop of the number that each turn would stack."""
+    sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
+
+    def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the sum so far with this turn's number, and nothing to stack."""
+        _no_carry, stacked = turn(row, [])
+        pair = np.stack([carry[0], *stacked])
+        return [np.asarray(RULES["reduce_sum"](lowering, sum_along_first, [pair])[0])], []
+
+    zero = RULES["reduce_sum"](lowering, sum_along_first, [np.empty(0, dtype=object)])[0]  # the sum of no numbers
+    total, _stacked = repeat_turns(lowering, count, [zero], add_number)
+    return list(total)
+
+
+def _find_sparse_product(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the factors of a product by a known matrix as (free, contracted) if its zeros leave few terms, else None.
+
+    A known factor is an array of numbers, the other one of nodes.
+    """
+    dimensions, (batch, _) = equation.params["dimension_numbers"]
+    tables = [_is_table(x) for x in inputs]
+    arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
+    if batch or not any(tables) or any(isinstance(x, StridedArray) for x in arrays):
+        return None
+    # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.
+    factors, terms = [], np.ones(1, dtype=np.int64)
+    for x, is_table, contracted in zip(arrays, tables, dimensions, strict=True):
+        free = [d for d in range(x.ndim) if d not in contracted]
+        rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
+        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_nonzero_entries(rows, 1))
+        factors.append(rows)
+    return (factors[0], factors[1]) if terms.sum() <= WRITTEN_OUT else None
+
+
+def _write_out_product(
+    lowering: Lowering, equation: JaxprEqn, factors: tuple[np.ndarray, np.ndarray]
+) -> list[np.ndarray]:
+    """Write out A B' entry by entry, terms with a known zero left out: entry (a, b) is the sum over k of a_k b_k.
+
+    `factors`: A and B as (rows, contracted axis); k ascends.
+    """
+    graph, type = lowering.graph, result_type(equation)
+    left, right = ([_find_nonzero_entries(graph, type, row) for row in factor] for factor in factors)
+    entries = []
+    for a in left:
+        for b in right:
+            terms = [graph.node("mul", type, a[k], b[k]) for k in a if k in b]
+            entries.append(combine_nodes(graph, "add", type, terms, 0.0))
+    return [arrange_nodes(entries, result_shape(equation))]
+
+
+def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
+    """Return the entries of a row that are no known zeros, by their places."""
+    if row.dtype != object:
+        return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
+    return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
+
+
+def _move_to_front(x: StridedArray, axis: int) -> StridedArray:
+    """Return a view with this axis first."""
+    order = [axis, *(a for a in range(x.ndim) if a != axis)]
+    return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
+
+
+def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
+    """Return the numbers of these axes in an array without the removed axis, or as they are if none is."""
+    return tuple(axes) if removed is None else tuple(a - (a > removed) for a in axes)
+
+
+def _make_reduction_rule(name: str) -> Rule:
+    """Return the rule of a reduction, such as `reduce_sum`: of short arrays at once, of long ones row by row."""
+
+    def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Lower the reduction of one array along the axes of the operation."""
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+        return _reduce_long(lowering, equation, name, inputs[0])
+
+    return lower_reduction
+
+
+def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) -> list[Value]:
+    """Lower the reduction of a long array in a loop: each turn reduces one row along its own axes.
+
+    The reduced rows are stacked, or reduced further one after another where the operation's axes include the first.
+    """
+    axes = equation.params["axes"]
+    # The same operation within a row, and on two rows to one; both have a result of the shape of a reduced row. A row
+    # lacks axis 0, so its other axes have numbers that are lower by one.
+    row_axes = tuple(axis - 1 for axis in axes if axis != 0)
+    shape = tuple(n for axis, n in enumerate(x.shape[1:]) if axis not in row_axes)
+    result = SimpleNamespace(aval=make_placeholder(shape, equation.outvars[0].aval.dtype))  # type: ignore[attr-defined]
+    within_row: Any = SimpleNamespace(params=equation.params | {"axes": row_axes}, outvars=[result])
+    of_two_rows: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[result])
+
+    def reduce_row(index: Node) -> np.ndarray:
+        """Return a row reduced along its own axes."""
+        return np.asarray(RULES[name](lowering, within_row, [lowering.nodes(x.row(index))])[0])
+
+    def stack_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return no carry, and the reduced row to stack."""
+        return [], [reduce_row(index)]
+
+    def accumulate_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the rows reduced so far with this one, and nothing to stack."""
+        pair = np.stack([carry[0], reduce_row(index)])
+        return [np.asarray(RULES[name](lowering, of_two_rows, [pair])[0])], []
+
+    if 0 not in axes:
+        _carry, stacked = repeat_turns(lowering, x.shape[0], [], stack_row)
+        return list(stacked)
+    # Accumulate from the neutral element on, which is the reduction of no rows.
+    start = RULES[name](lowering, of_two_rows, [np.empty((0, *shape), dtype=object)])[0]
+    total_of_rows, _stacked = repeat_turns(lowering, x.shape[0], [start], accumulate_row)
+    return list(total_of_rows)
+
+
+REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
+IN_MEMORY |= {name: _make_row_by_row_rule(name) for name in OF_ENTRIES}
+IN_MEMORY |= {name: _make_reduction_rule(name) for name in REDUCTIONS}
+IN_MEMORY |= {"dot_general": _dot_general}
+RULES |= {"dot_general": _multiply_nodes}

@@ -1,0 +1,275 @@
+"""Rules of special functions by their series: incomplete gamma functions, Bessel functions, the digamma function."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+
+from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, make_placeholder, type_of
+from straightline.nodes import Type, Unsupported
+
+EPSILON = float(np.finfo(np.float64).eps)
+FAR = 30.0  # the argument of a Bessel function from which its asymptotic series has all digits
+BERNOULLI = [1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160]  # B_2n / (2 n)
+TINY = float(np.finfo(np.float64).tiny) / EPSILON
+LARGE, TERMS = 2000.0, 20  # the shape from which gamma masses are expanded, to a^-3, and the terms of a coefficient
+TURNS = 5000  # of a series or a fraction, several times as many as it takes
+
+
+class SeriesState(NamedTuple):
+    """State of a series: a number that counts its terms, the last term, and the sum."""
+
+    step: jax.Array
+    term: jax.Array
+    total: jax.Array
+
+
+class ContinuedFraction(NamedTuple):
+    """State of a continued fraction: the turn, Lentz's quotients C and D, the value, and its last relative change."""
+
+    turn: jax.Array
+    c: jax.Array
+    d: jax.Array
+    value: jax.Array
+    change: jax.Array
+
+
+def regularised_incomplete_gammas(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute the mass below and above x of the gamma law of shape a: P(a, x) and Q(a, x) = 1 - P, each to its digits.
+
+    With the density p = x^a e^-x / Gamma(a): up to x = a + 1 P is a series, above it Q is a continued fraction
+    (`_sum_lower_series`, `_evaluate_upper_fraction`); for a > LARGE both are expanded in 1 / a. NaN where a or x is
+    below zero.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.5.29 and 6.5.31.
+    """
+    is_valid, is_large = (a > 0) & (x >= 0), a > LARGE
+    # Where neither series nor fraction serves, 1 stands for a and x, so that no NaN comes into the loops.
+    serves_none = is_large | ~is_valid
+    shape, place = jnp.where(serves_none, 1.0, a), jnp.where(serves_none, 1.0, x)
+    above = place > shape + 1
+    density = jnp.exp(shape * jnp.log(place) - place - jax.lax.lgamma(shape))
+    lower = density * _sum_lower_series(shape, place, skipped=above)
+    upper = density * _evaluate_upper_fraction(shape, place, serves=above)
+    # The smaller mass as computed, to all its digits; the other one is 1 minus it.
+    p = jnp.where(place == jnp.inf, 1.0, jnp.where(above, 1 - upper, lower))
+    q = jnp.where(above & (place < jnp.inf), upper, 1 - p)
+    expanded_p, expanded_q = regularised_incomplete_gammas_of_large_shape(a, x)
+    use_expansion = is_large & (x < jnp.inf)
+    p, q = jnp.where(use_expansion, expanded_p, p), jnp.where(use_expansion, expanded_q, q)
+    p, q = jnp.where(x == jnp.inf, 1.0, p), jnp.where(x == jnp.inf, 0.0, q)
+    at_zero = (a == 0) & (x > 0)  # a law of shape 0 is all at 0
+    p, q = jnp.where(at_zero, 1.0, p), jnp.where(at_zero, 0.0, q)
+    return jnp.where(is_valid | at_zero, p, jnp.nan), jnp.where(is_valid | at_zero, q, jnp.nan)
+
+
+def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Array:
+    """Return P(a, x) / (x^a e^-x / Gamma(a)) = sum_n x^n / (a (a + 1) ... (a + n)); 0 where it is skipped.
+
+    It converges fast for x < a + 1.
+    """
+
+    def add_term(state: SeriesState) -> SeriesState:
+        """Add the next term, the last one times x / (a + n); `state.step` is a + n."""
+        denominator, term, total = state
+        term = term * x / (denominator + 1)
+        return SeriesState(denominator + 1, term, total + term)
+
+    def has_more_terms(state: SeriesState) -> jax.Array:
+        """Return whether the last term counts: a series that is skipped ends at once."""
+        return (state.term > EPSILON * state.total) & (state.step < a + TURNS)
+
+    first = jnp.where(skipped, 0.0, 1 / a)
+    return jax.lax.while_loop(has_more_terms, add_term, SeriesState(a, first, first)).total
+
+
+def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> jax.Array:
+    """Return Q(a, x) / (x^a e^-x / Gamma(a)) where x > a + 1, by a continued fraction; elsewhere any number.
+
+    It is 1 / (x + 1 - a - 1 (1 - a) / (x + 3 - a - 2 (2 - a) / (x + 5 - a - ...))), by Lentz's method: the value is a
+    product of C_n D_n, quotients of consecutive numerators and of consecutive denominators.
+
+    Source: Lentz, Generating Bessel functions in Mie scattering calculations using continued fractions (1976).
+    """
+
+    def continue_fraction(state: ContinuedFraction) -> ContinuedFraction:
+        """Add the next level: partial numerator n (a - n) over x + 2 n + 1 - a."""
+        n, c, d, fraction, _ = state
+        numerator, b = n * (a - n), x + 2 * n + 1 - a
+        c, d = b + numerator / c, 1 / _replace_zero_by_tiny(b + numerator * d)
+        return ContinuedFraction(n + 1, _replace_zero_by_tiny(c), d, fraction * c * d, jnp.abs(c * d - 1))
+
+    def still_changes(state: ContinuedFraction) -> jax.Array:
+        """Return whether the last level changed the value; a fraction that does not serve ends at once."""
+        return (state.change > EPSILON) & (state.turn < TURNS)
+
+    first = 1 / jnp.where(serves, x + 1 - a, 1.0)
+    start = ContinuedFraction(
+        turn=jnp.ones_like(x), c=jnp.full_like(x, 1 / TINY), d=first, value=first, change=jnp.where(serves, 1.0, 0.0)
+    )
+    return jax.lax.while_loop(still_changes, continue_fraction, start).value
+
+
+def regularised_incomplete_gammas_of_large_shape(a: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute P(a, x) and Q(a, x), the masses of the gamma law of a large shape a below and above x, by expansion.
+
+    A series in powers of x would take many terms.
+
+    With y^2 / 2 = m - log(1 + m), m = x / a - 1, y of the sign of m,
+    Q = erfc(y root(a / 2)) / 2 + e^(-a y^2 / 2) / root(2 pi a) (c_0(y) + c_1(y) / a + c_2(y) / a^2), P = 1 - Q.
+
+    Source: Temme, The asymptotic expansion of the incomplete gamma functions (1979); DLMF 8.12.3, 8.12.4.
+    """
+    m = jnp.clip((x - a) / a, -0.9, 3.0)  # beyond these limits the smaller mass is below the least positive number
+    # y^2 / 2 = m - log(1 + m) = m s - 2 s (s^2 / 3 + s^4 / 5 + ...), s = m / (2 + m): near 0, where the difference
+    # would cancel, by the series up to s^26 / 27, whose next term is below rounding for |m| < 0.4.
+    s = m / (2 + m)
+    tail = jnp.zeros_like(m)
+    for n in range(27, 1, -2):
+        tail = (tail + 1 / n) * s * s
+    half_square = jnp.where(jnp.abs(m) < 0.4, m * s - 2 * s * tail, m - jnp.log1p(m))
+    y = jnp.where(m < 0, -1.0, 1.0) * jnp.sqrt(2 * half_square)
+    # c_0(y) + c_1(y) / a + c_2(y) / a^2 from the last on; each c_k is a power series of y, by Horner's rule.
+    correction = jnp.zeros_like(y)
+    for coefficients in expand_coefficients()[::-1]:
+        c_k = jnp.zeros_like(y)
+        for c in coefficients[::-1]:
+            c_k = c_k * y + c
+        correction = correction / a + c_k
+    correction = correction * jnp.exp(-a * half_square) / jnp.sqrt(2 * np.pi * a)
+    z = y * jnp.sqrt(a / 2)
+    return jax.lax.erfc(-z) / 2 - correction, jax.lax.erfc(z) / 2 + correction
+
+
+@cache
+def expand_coefficients() -> list[list[float]]:
+    """Compute the power series in y of c_0, c_1 and c_2, of `TERMS` terms.
+
+    c_0 = 1 / m - 1 / y, c_k = c_(k-1)' / y + (-1)^k g_k / m with g_1 = 1 / 12, g_2 = 1 / 288, and y (1 + m) = m m'.
+    """
+    count = TERMS + 5
+    # m = y (1 + b_1 y + b_2 y^2 + ...), and 1 / m = (1 + r_1 y + ...) / y.
+    b = [Fraction(1)]
+    for n in range(1, count):
+        known = sum((b[k] * b[n - k] * (n - k + 1) for k in range(1, n)), Fraction(0))
+        b.append((b[n - 1] - known) / (n + 2))
+    r = [Fraction(1)]
+    for n in range(1, count):
+        r.append(-sum((b[k] * r[n - k] for k in range(1, n + 1)), Fraction(0)))
+    # The poles at y = 0 cancel.
+    series = [r[1:]]
+    for sign_g in (Fraction(-1, 12), Fraction(1, 288)):
+        before = series[-1]
+        series.append([(n + 2) * before[n + 2] + sign_g * r[n + 1] for n in range(len(before) - 2)])
+    return [[float(c) for c in one[:TERMS]] for one in series]
+
+
+def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
+    """Return x, a tiny number for zero."""
+    return jnp.where(x == 0, TINY, x)
+
+
+def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
+    """Compute e^-|x| I_v(x), the scaled modified Bessel function of order v = 0 or 1.
+
+    Up to |x| = FAR by the power series I_v = (x / 2)^v sum_k (x^2 / 4)^k / (k! (k + v)!), v the `order`. Beyond by the
+    asymptotic series I_v = e^x / root(2 pi x) (1 + sum_k a_k), a_k = a_k-1 ((2 k - 1)^2 - 4 v^2) / (8 k x), a_0 = 1,
+    whose terms fall to 1e-26. Both are summed by one loop, whose ratio of terms is that of the series that serves.
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 9.6.10 and 9.7.1.
+    """
+    size = jnp.abs(x)
+    is_far = size > FAR
+
+    def add_term(state: SeriesState) -> SeriesState:
+        """Add term k of the series that serves: the last term times a ratio."""
+        k, term, total = state
+        power_ratio = size * size / (4 * k * (k + order))
+        asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(is_far, size, 1.0))
+        ratio = jnp.where(is_far, asymptotic_ratio, power_ratio)
+        return SeriesState(k + 1, term * ratio, total + term * ratio)
+
+    def has_more_terms(state: SeriesState) -> jax.Array:
+        """Return whether the last term is above rounding."""
+        return jnp.abs(state.term) > EPSILON / 8 * state.total
+
+    # The term of k = 0 is 1, or (x / 2) of I_1's power series.
+    first = jnp.where(is_far | (order == 0), 1.0, size / 2)
+    total = jax.lax.while_loop(has_more_terms, add_term, SeriesState(jnp.ones_like(x), first, first)).total
+    scale = jnp.where(is_far, 1 / (np.sqrt(2 * np.pi) * jnp.sqrt(jnp.where(is_far, size, 1.0))), jnp.exp(-size))
+    value = jnp.where(jnp.isnan(x), jnp.nan, total * scale)
+    if order == 0:
+        return value
+    return jnp.where(x < 0, -value, jnp.where(x == 0, x, value))  # I_1 is odd; zeros keep their sign
+
+
+def digamma(x: jax.Array) -> jax.Array:
+    """Compute the derivative of log Gamma(x): at 10 and more from its asymptotic series, to which a recurrence leads.
+
+    psi(x) = psi(x + 1) - 1 / x = log x - 1 / (2 x) - sum_n B_2n / (2 n x^2n), psi(x) = psi(1 - x) - pi / tan(pi x).
+
+    Source: Abramowitz and Stegun, Handbook of mathematical functions, 6.3.5, 6.3.7 and 6.3.18.
+    """
+    # Where x is not positive, psi(1 - x) first. From `large` = y + n >= 10 back: psi(y) = psi(y + n) - sum 1 / (y + i).
+    mirrored = x <= 0
+    large = jnp.where(mirrored, 1 - x, x)
+    reciprocals = jnp.zeros_like(x)
+    for _ in range(10):
+        is_small = large < 10
+        reciprocals, large = reciprocals + jnp.where(is_small, 1 / large, 0.0), jnp.where(is_small, large + 1, large)
+    square, tail = 1 / (large * large), jnp.zeros_like(x)
+    for coefficient in BERNOULLI[::-1]:
+        tail = (tail + coefficient) * square
+    value = jnp.log(large) - 0.5 / large - tail - reciprocals
+    # tan(pi x) by the distance from the nearest whole number, which is exact; a pole at each of these.
+    distance = x - jnp.round(x)
+    reflection = np.pi / jnp.tan(np.pi * jnp.where(distance == 0, 1.0, distance))
+    return jnp.where(mirrored, jnp.where(distance == 0, jnp.nan, value - reflection), value)
+
+
+def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Return P(a, x) of `igamma`, or Q(a, x) of `igammac`."""
+    below, above = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
+    return [above if equation.primitive.name == "igammac" else below]
+
+
+def _inline_in_double(
+    function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]
+) -> list[Value]:
+    """Return the results of a function of scalars over arrays, computed in double precision of either."""
+    avals: list[Any] = [v.aval for v in equation.invars]
+    if avals[0].dtype not in (np.float64, np.float32):
+        raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
+    program = _trace_over_arrays(function, len(avals), avals[0].shape)
+    results = lowering.inline_program(program, [_convert(lowering, "f64", x) for x in inputs])
+    return [_convert(lowering, type_of(avals[0]), x) for x in results]
+
+
+def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
+    """Return an array's numbers in another type."""
+    nodes = lowering.nodes(value)
+    return arrange_nodes((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
+
+
+@cache
+def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
+    """Return the program of a function of `count` scalars over arrays of a shape."""
+    over_arrays = function
+    for _ in shape:
+        over_arrays = jax.vmap(over_arrays)
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(over_arrays)(*[make_placeholder(shape, np.float64)] * count)
+
+
+OF_ONE: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "bessel_i0e": partial(scaled_bessel, 0),
+    "bessel_i1e": partial(scaled_bessel, 1),
+    "digamma": digamma,
+}
+IN_MEMORY |= {"igamma": _lower_igamma, "igammac": _lower_igamma}
+IN_MEMORY |= {name: partial(_inline_in_double, function) for name, function in OF_ONE.items()}

@@ -1,0 +1,136 @@
+"""Arrays in memory as views of a buffer with strides, as NumPy's; numbers are loaded when they are used."""
+
+import math
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from straightline.graph import Graph
+from straightline.nodes import Block, Buffer, Node, Type, Unsupported
+from straightline.size_limits import LOADED
+
+
+class StridedArray:
+    """Array with entry (i, j, ...) at offset + sum strides * (i, j, ...) + sum of moves, pairs (stride, node)."""
+
+    __slots__ = ("buffer", "loaded", "moves", "offset", "shape", "strides")
+
+    def __init__(
+        self,
+        buffer: Buffer,
+        shape: tuple[int, ...],
+        strides: tuple[int, ...],
+        offset: int = 0,
+        moves: tuple[tuple[int, Node], ...] = (),
+    ):
+        self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
+        self.loaded: tuple[Block, np.ndarray] | None = (
+            None  # nodes that load it, after the block that they were made in
+        )
+
+    @classmethod
+    def of_whole_buffer(cls, buffer: Buffer) -> "StridedArray":
+        """Return the view of a whole buffer."""
+        return cls(buffer, buffer.shape, contiguous_strides(buffer.shape))
+
+    @property
+    def ndim(self) -> int:
+        """Return the number of axes."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Return the number of entries."""
+        return math.prod(self.shape)
+
+    @property
+    def type(self) -> Type:
+        """Return the type of its numbers."""
+        return self.buffer.type
+
+    def view(
+        self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
+    ) -> "StridedArray":
+        """Return another view of the same memory, at a further offset."""
+        return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
+
+    def row(self, index: Node | int) -> "StridedArray":
+        """Return entry `index` along the first axis."""
+        if isinstance(index, int) or index.op == "constant":
+            known = index if isinstance(index, int) else int(index.value)
+            return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
+        return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
+
+    def get_known_numbers(self) -> np.ndarray:
+        """Return the numbers of a known array: a view of its table with these strides, which NumPy counts in bytes."""
+        assert self.buffer.table is not None
+        table = np.ascontiguousarray(self.buffer.table).ravel()[self.offset :]
+        return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
+
+    def nodes(self, graph: Graph) -> np.ndarray:
+        """Return a node for each entry, which loads it: once in a block, for the blocks inside it too."""
+        if self.loaded is None or self.loaded[0] not in graph.current.list_enclosing_blocks():
+            if self.size > LOADED:
+                raise Unsupported(f"an array of {self.size} numbers at once")
+            self.loaded = graph.current, self._load_entries(graph)
+        return self.loaded[1]
+
+    def _load_entries(self, graph: Graph) -> np.ndarray:
+        """Return a node for each entry, which loads it."""
+        strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
+        nodes = np.empty(self.shape, dtype=object)
+        for index in product(*map(range, self.shape)):
+            offset = self.offset + sum(s * i for s, i in zip(self.strides, index, strict=True))
+            nodes[index] = graph.load(self.buffer, offset, strides, indices)
+        return nodes
+
+    def view_in_shape(self, shape: tuple[int, ...]) -> "StridedArray | None":
+        """Return a view of the same numbers in another shape, None if no strides describe it."""
+        if not self.size:
+            return self.view(shape, (0,) * len(shape))
+        axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
+        strides = _split_axes(_merge_axes(axes), shape)
+        return None if strides is None else self.view(shape, strides)
+
+
+def _merge_axes(axes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return axes, pairs of length and stride, with each that continues the next one merged with it.
+
+    Axis a continues axis b behind it if its stride is b's length times b's stride: both are one of length n_a n_b.
+    """
+    merged: list[tuple[int, int]] = []
+    for length, stride in reversed(axes):
+        if merged and stride == merged[-1][0] * merged[-1][1]:
+            merged[-1] = length * merged[-1][0], merged[-1][1]
+        else:
+            merged.append((length, stride))
+    return merged[::-1]
+
+
+def _split_axes(axes: Sequence[tuple[int, int]], shape: Sequence[int]) -> list[int] | None:
+    """Return the strides of an array of this shape whose axes are parts of these ones, in order; None if none are.
+
+    axes: pairs of length and stride, merged, with as many entries as the shape. From the last axis on, each new axis
+    is split off what is left of an old one.
+    """
+    remaining_axes = list(axes)
+    left, stride = 1, 0  # entries of the present old axis that are not split off yet, and the stride between them
+    strides: list[int] = []
+    for length in reversed(shape):
+        if length == 1:
+            strides.append(0)
+            continue
+        if left == 1:
+            left, stride = remaining_axes.pop()
+        if left % length:
+            return None
+        strides.append(stride)
+        left, stride = left // length, stride * length
+    return strides[::-1]
+
+
+def contiguous_strides(shape: Sequence[int]) -> tuple[int, ...]:
+    """Return the strides of an array of this shape in row-major order: the last axis is innermost."""
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    return tuple(int(s) for s in strides[: len(shape)])

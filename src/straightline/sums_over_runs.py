@@ -1,0 +1,275 @@
+"""Compiled programs over consecutive runs: some results summed over them, others returned run by run."""
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from straightline.call_arrays import allocate_aligned, convert_to_memory, list_addresses
+from straightline.compiled import get_thread_pool
+from straightline.constant_folding import DTYPES
+from straightline.llvm.module_text import write_module
+from straightline.lowering import make_placeholder
+from straightline.machine_code import TieredCode, choose_hasty_width, find_processor_features
+from straightline.program import Program, SummedOutputs, fold_rows_into_batches, lower_function, row_length_of_sums
+
+PARTS = 64  # sums of their own, which computers of any number of cores share out
+
+
+class SummingProgram:
+    """Compiled program of a run's number and of arguments that all runs share: some results are summed over runs.
+
+    `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
+    """
+
+    def __init__(self, program: Program, summed: SummedOutputs):
+        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number."""
+        differs = [n == summed.number for n in range(len(program.inputs))]
+        self.summed, self.tree = summed, program.tree
+        self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
+        _name, _flags, fuses = find_processor_features()
+        self.code = write_module(program, differs, width=None, fuse=fuses, summed=summed)
+        self.common, self.operations = self.code.common, self.code.operations
+        self.width = self.code.width
+        self.blocks = TieredCode(self.code.blocks, (choose_hasty_width(self.width), self.width))
+        self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
+
+    def measure_memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
+        """Return bytes of what is collected of `runs`, of `lanes` sums kept apart, and of the variables of all runs.
+
+        Of those variables all runs share some; each of the blocks that are computed at once (`in_flight`) has others.
+        """
+        length = row_length_of_sums(self.width, self.summed.batches)
+        collected = sums = 0.0
+        for buffer, summed, common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
+            if common:
+                continue
+            if summed:
+                sums += 8.0 * buffer.size * length
+            else:
+                collected += float(buffer.size) * np.dtype(DTYPES[buffer.type]).itemsize
+        return runs * collected, lanes * sums, float(self.code.shared) + in_flight * float(self.code.scratch)
+
+    def bind_arguments(self, arguments: Sequence[Any], runs: int) -> "SummingProgramWithArguments":
+        """Return the program with its arguments (all but the run's number), and what all runs share, computed.
+
+        The code is made for as many runs as will follow.
+        """
+        return SummingProgramWithArguments(self, arguments, runs)
+
+    def __call__(self, *arguments: PyTree, runs: int, first: int = 0) -> PyTree:
+        """Compute runs on all cores; return a tree of sums, (..., batch), and of what is collected, (run, ...).
+
+        The runs are split into at most PARTS parts, each with sums of its own, which are added in order: the parts
+        depend on the count of runs alone, so that the bits do not depend on the number of cores.
+
+        Args:
+            arguments: trees like the examples.
+            runs: how many.
+            first: number of the first one; 0 by default.
+        """
+        # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
+        begun = self.bind_arguments(jax.tree.leaves(arguments), runs)
+        part_length = -(-runs // (PARTS * self.width)) * self.width
+        starts = range(first, first + runs, part_length)
+        sums = [begun.make_zero_sums() for _ in starts]
+
+        def compute_part(part: int) -> list[np.ndarray | None]:
+            """Add the runs of a part to its sums; return its results that are collected, None for all others."""
+            return begun.add_runs(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
+
+        collected = list(get_thread_pool().map(compute_part, range(len(starts))))
+        return jax.tree.unflatten(self.tree, self._join_results_of_parts(begun, sums, collected, first, runs))
+
+    def _join_results_of_parts(
+        self,
+        begun: "SummingProgramWithArguments",
+        sums: Sequence[Sequence[np.ndarray]],
+        collected: Sequence[Sequence[np.ndarray | None]],
+        first: int,
+        runs: int,
+    ) -> list[Any]:
+        """Return each result, leaf by leaf, from the sums of parts of the runs and from what each part collected.
+
+        A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
+        runs share is repeated for each run, or counts once for each run of a batch.
+        """
+        totals, runs_by_batch = (
+            iter(begun.add_partial_sums(sums)),
+            _count_runs_by_batch(first, runs, self.summed.batches),
+        )
+        leaves: list[Any] = []
+        for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
+            if shared is None:
+                leaves.append(next(totals) if is_summed else np.concatenate(parts))
+            elif is_summed:
+                leaves.append(shared[..., None] * runs_by_batch)
+            else:
+                leaves.append(np.broadcast_to(shared, (runs, *shared.shape)))
+        return leaves
+
+
+class SummingProgramWithArguments:
+    """A summing program whose shared arguments are given; `shared`: results that all runs share, None for others."""
+
+    def __init__(self, program: SummingProgram, arguments: Sequence[Any], runs: int):
+        """Convert the arguments, compute what all runs share, and make code for about so many runs."""
+        self.program, self.summed = program, program.summed.outputs
+        self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
+        self.memory = allocate_aligned(program.code.shared)
+        # Compute what all runs share; the number of the run and results of runs are not used.
+        self.shared: list[np.ndarray | None] = [None] * len(program.common)
+        if program.once is not None:
+            number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
+            pointers = self._list_pointers(number, results)
+            once = program.once.choose_machine(1)
+            once.run(pointers.ctypes.data, 0, 0, 1, 1)
+        for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
+            if program.common[n]:
+                kind = np.dtype(DTYPES[buffer.type])
+                computed = self.memory[offset : offset + buffer.size * kind.itemsize]
+                self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
+        self._machine = None if all(program.common) else program.blocks.choose_machine(-(-runs // program.width))
+
+    def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
+        """Return sums over no runs of each summed result that runs do not share, for `add` and `add_partial_sums`.
+
+        `memory`: sums that nobody needs any more, of which the last are taken, and filled, if their shapes fit.
+        """
+        length = row_length_of_sums(self.program.width, self.program.summed.batches)
+        shapes = [(*b.shape, length) for b, s in self._list_outputs() if s]
+        try:  # threads may take from it at once
+            taken = [] if memory is None else memory.pop()
+        except IndexError:
+            taken = []
+        if [x.shape for x in taken] != shapes:
+            return [np.zeros(shape) for shape in shapes]
+        for x in taken:
+            x.fill(0.0)
+        return taken
+
+    def add_runs(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
+        """Add the runs of these numbers (run,) to `sums` in place; return what is collected of them.
+
+        That is for each result, leaf by leaf, an array (run, ...), or None where it is summed or all runs share it.
+        """
+        numbers = np.ascontiguousarray(runs, dtype=np.uint32)
+        outputs, collected = self._allocate_outputs(len(numbers), sums)
+        # There is no code for runs where they share all results.
+        if len(numbers) and self._machine is not None:
+            scratch = allocate_aligned(self.program.code.scratch)
+            pointers = self._list_pointers(numbers, outputs)
+            blocks = -(-len(numbers) // self._machine.width)  # a block: the runs of one vector
+            self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
+        return collected
+
+    def _allocate_outputs(
+        self, runs: int, sums: Sequence[np.ndarray]
+    ) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
+        """Return an array for each output of the code, and the same with None for all that is not collected.
+
+        An output is one of `sums`, a new array (run, ...), or, where all runs share the result, an empty one.
+        """
+        remaining_sums = iter(sums)
+        outputs: list[np.ndarray] = []
+        collected: list[np.ndarray | None] = []
+        for (buffer, summed), common in zip(self._list_outputs(), self.program.common, strict=True):
+            if summed:
+                outputs.append(next(remaining_sums))
+            else:
+                shape = (0,) if common else (runs, *buffer.shape)
+                outputs.append(np.empty(shape, DTYPES[buffer.type]))
+            collected.append(None if summed or common else outputs[-1])
+        return outputs, collected
+
+    def add_partial_sums(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+        """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
+
+        The first of them is overwritten.
+        """
+        return [
+            fold_rows_into_batches(_add_in_order(sums), self.program.summed.batches)
+            for sums in zip(*parts, strict=True)
+        ]
+
+    def _list_outputs(self) -> list[tuple[Any, bool]]:
+        """Return each output, and whether it is a sum over runs in memory: what all runs share is none."""
+        parts = zip(self.program.code.outputs, self.program.summed.outputs, self.program.common, strict=True)
+        return [(buffer, summed and not common) for buffer, summed, common in parts]
+
+    def _list_pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the addresses of inputs, tables, results and the memory that all runs share."""
+        position = self.program.summed.number
+        inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
+        every = [*inputs, *self.program.code.tables, *results, self.memory]
+        return np.array(list_addresses(every), dtype=np.uint64)
+
+
+def accumulate(
+    function: Callable[..., PyTree],
+    *examples: PyTree,
+    batches: int = 1,
+    known: Mapping[int, np.ndarray] = MappingProxyType({}),
+    single: bool = False,
+) -> SummingProgram:
+    """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
+
+    Such is a Monte Carlo simulation: the run's number makes its key. What is summed takes no more memory for more runs.
+    The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+
+    Args:
+        function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what
+            is summed (real numbers, in a tree) and what is collected run by run (a tree, such as `()`).
+        examples: the arguments without the number; shapes and types count alone, but for what is known.
+        batches: sums that are kept apart, run r in that of r mod `batches`, from which the mean has an error; 1 by
+            default.
+        known: of examples by their number among the leaves, which entries (a mask) are the example's in every call,
+            such as zeros; they are constants of the code. None by default.
+        single: whether numbers are float32, and draws those of JAX by default; double unless so. Sums are double.
+
+    Raises:
+        Unsupported: an operation that native code does not take, with the line that it comes from.
+        ValueError: a function that returns no pair.
+    """
+    find_processor_features()  # refuses a processor that LLVM does not know
+    leaves = jax.tree.leaves(examples)
+    known_numbers = {n: (np.asarray(mask), np.asarray(leaves[n])) for n, mask in known.items()}
+    # The last argument is the number of the run.
+    program = lower_function(function, *examples, make_placeholder((), np.uint32), known=known_numbers, single=single)
+    summed_leaves = _count_summed_leaves(program.tree)
+    summed = tuple(n < summed_leaves for n in range(len(program.outputs)))
+    return SummingProgram(program, SummedOutputs(outputs=summed, batches=batches, number=len(leaves)))
+
+
+def _count_summed_leaves(tree: Any) -> int:
+    """Return how many leaves are summed: those of the first of the pair that a function of a run returns.
+
+    Raises:
+        ValueError: a tree of results that is no pair.
+    """
+    parts, kind = tree.children(), tree.node_data()
+    if kind is None or kind[0] is not tuple or len(parts) != 2:
+        expected = "a pair of what is summed and what is collected"
+        raise ValueError(f"function of a run: expected {expected}, got {tree}")
+    count: int = parts[0].num_leaves
+    return count
+
+
+def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
+    """Add arrays in order, in the memory of the first: to allocate more would take longer than to add."""
+    total, *others = sums
+    for other in others:
+        total += other
+    return total
+
+
+def _count_runs_by_batch(first: int, runs: int, batches: int) -> np.ndarray:
+    """Return how many of the runs from `first` on each batch has; run r is in batch r mod `batches`.
+
+    All have the same number, but for the rest, of which the batches from that of the first run on have one each.
+    """
+    rest = np.arange(first, first + runs % batches)
+    return np.bincount(rest % batches, minlength=batches) + runs // batches
