@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import (
+from heliograph.filters.gaussians_in_states import beside_gaussians, find_equal_states, means_of, with_gaussians
+from heliograph.filters.linear_recursion import (
     FilterRecursion,
     Recursion,
     linear_start,
@@ -29,6 +30,7 @@ from heliograph.filters.recursion import (
     state_after_rows,
     sum_chunk,
 )
+from heliograph.filters.row_windows import Which, join_results, take, take_windows, take_windows_in_parts
 from heliograph.filters.settled_covariance import (
     CompleteBlocks,
     SettledState,
@@ -39,8 +41,6 @@ from heliograph.filters.settled_covariance import (
     scan_settled_rows,
     sum_settled_rows,
 )
-from heliograph.filters.states import beside_gaussians, find_equal_states, means_of, with_gaussians
-from heliograph.filters.windows import Which, join_results, take, take_windows, take_windows_in_parts
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 
 CHUNKS = 16  # at least: two cores with eight lanes each

@@ -14,9 +14,9 @@ from heliograph.engine.choice import choose_code, compile_on_call, compute_once
 from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.signal_moments import signal_of
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter

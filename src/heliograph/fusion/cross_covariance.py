@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import LinearStep
+from heliograph.filters.linear.precomputed_filter import LinearStep
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.traced import library

@@ -18,7 +18,7 @@ from heliograph.fusion.joint_covariance_weights import (
     weigh_covariance,
     weigh_covariance_by_component,
 )
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.fusion.intersection import invert
+from heliograph.fusion.covariance_intersection import invert
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.h_infinity.coordinates import scale_steps
 from heliograph.h_infinity.error_system import LARGEST, GrowthSystem, symmetric_weight
+from heliograph.h_infinity.scaled_coordinates import scale_steps
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,

@@ -22,11 +22,11 @@ from heliograph.filters.chunks import (
     rescan_wrong_starts,
     scan_means_where_settled,
 )
-from heliograph.filters.recursion import linear_start, scan_chunk
+from heliograph.filters.gaussians_in_states import find_equal_states, select_state
+from heliograph.filters.linear_recursion import linear_start, scan_chunk
+from heliograph.filters.row_windows import Which, take, take_windows
 from heliograph.filters.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
-from heliograph.filters.states import find_equal_states, select_state
-from heliograph.filters.windows import Which, take, take_windows
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.smoothing.fixed_interval_lag_point import sum_nis_over_blocks

@@ -10,11 +10,11 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.gaussian.bounds import as_scalars, observe_by_young, scalars_as_array
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.gaussian.update import AbstractUpdate, combine_hop_ranges
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal
+from heliograph.filters.gaussian.uncertain_channel_bounds import as_scalars, observe_by_young, scalars_as_array
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, combine_hop_ranges
 from heliograph.numerics.check import check_count
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph_studies import check_fields

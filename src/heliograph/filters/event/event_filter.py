@@ -12,7 +12,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.belief import EventBelief
+from heliograph.filters.event.event_filter_state import EventBelief
 from heliograph.filters.event.gaussian_sum import (
     FLOOR,
     GaussianSum,
@@ -29,10 +29,10 @@ from heliograph.filters.event.joint_gaussian import (
     predict_with_reference,
     set_known_components,
 )
-from heliograph.filters.event.sender_labels import SilentLabels, relabel_sent
+from heliograph.filters.event.sender_status_probabilities import SilentLabels, relabel_sent
 from heliograph.filters.event.silent_region import SilentRegion
-from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start, smoother_step_by_transform
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.modes.arrival_patterns import SideInformation, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal

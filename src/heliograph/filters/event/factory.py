@@ -6,10 +6,10 @@ import jax
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
-from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.event_filter import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.event.gaussian_in_ball import MOST_COMPONENTS
+from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_by_noise

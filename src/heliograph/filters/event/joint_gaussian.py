@@ -17,9 +17,9 @@ from heliograph.factors.gaussian import (
 )
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
-from heliograph.filters.gaussian.belief import image_of, process_noise
-from heliograph.filters.gaussian.signal import gain_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import image_of, process_noise
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import gain_noise, signal_of
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.linalg import outer

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.event.ball import truncate_to_ball
+from heliograph.filters.event.gaussian_in_ball import truncate_to_ball
 from heliograph.filters.event.gaussian_sum import (
     GaussianSum,
     concatenate,

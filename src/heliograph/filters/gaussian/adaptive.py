@@ -15,8 +15,8 @@ from heliograph.filters.base import (
     corrects,
     predicts,
 )
-from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
 from heliograph.filters.gaussian.robust import RobustFilter, predict_behind_channel, signal_without_noise
 from heliograph.filters.gaussian.robust_scores import (
     SMALLEST,
@@ -28,7 +28,7 @@ from heliograph.filters.gaussian.robust_scores import (
     reweight,
     update_by_score,
 )
-from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
+from heliograph.filters.received_outlier_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step

@@ -17,7 +17,7 @@ from heliograph.factors.diffuse import (
     start_diffuse,
 )
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import process_noise, second_moments_at_start
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import perfect
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise

@@ -1,14 +1,14 @@
 """Gaussian filters of plant, sensor and channel: Kalman's, the extended and the cubature filter, and a naive one."""
 
 from heliograph.filters.base import make_sizes
-from heliograph.filters.gaussian.belief import prior_of
 from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
-from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
+from heliograph.filters.gaussian.gaussian_prediction import prior_of
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, Linearization
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_by_noise
 from heliograph.model.fading import memory_matters, without_memory

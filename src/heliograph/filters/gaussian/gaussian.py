@@ -7,17 +7,17 @@ import jax.numpy as jnp
 from heliograph.factors.gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.signal import (
+from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.moving_origin import center_filter
+from heliograph.filters.gaussian.signal_moments import (
     ArrivedInnovation,
     Signal,
     condition_on_measurement,
     make_received_noise,
     signal_of,
 )
-from heliograph.filters.gaussian.two_part_mean import center_filter
-from heliograph.filters.gaussian.update import AbstractUpdate
-from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
+from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step, first

@@ -13,7 +13,9 @@ from heliograph.filters.base import (
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.moving_origin import center_filter
 from heliograph.filters.gaussian.robust_scores import (
     AbstractWeights,
     PredictedMeasurement,
@@ -23,10 +25,8 @@ from heliograph.filters.gaussian.robust_scores import (
     update_by_score,
     update_weighted,
 )
-from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.gaussian.two_part_mean import center_filter
-from heliograph.filters.robust_noise import ReceivedNoise
+from heliograph.filters.gaussian.signal_moments import Signal, make_received_noise, signal_of
+from heliograph.filters.received_outlier_noise import ReceivedNoise
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant
@@ -97,7 +97,7 @@ class Gate(AbstractWeights):
         c: limit of the squared deviation d^2 (default 9).
         after: how many refusals of a number in a row open the state for it; None for none.
         seconds: for how long, where the plant has the input dt; None for none. Let it be so long that the other sensors
-            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.giving_in`).
+            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.recovering_gate`).
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001).
     """

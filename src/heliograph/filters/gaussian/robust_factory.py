@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from heliograph.filters.gaussian.belief import prior_of
-from heliograph.filters.gaussian.giving_in import GivingInFilter, build_giving_in_filter
+from heliograph.filters.gaussian.gaussian_prediction import prior_of
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.recovering_gate import GivingInFilter, build_giving_in_filter
 from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
 from heliograph.filters.gaussian.robust_scores import AbstractWeights
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
+from heliograph.filters.received_outlier_noise import ReceivedNoise, Vector, separate_outlier_noise
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first

@@ -18,7 +18,7 @@ from heliograph.factors.gaussian import (
     take_leading,
 )
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.filters.robust_noise import NoiseBranches
+from heliograph.filters.received_outlier_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow

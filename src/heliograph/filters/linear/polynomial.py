@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.linear.mean_before_data import UnconditionalMean, centre_plant, mean_before_data
-from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
-from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.linear.scheduled_gains import LinearSystemFilter, ScheduledFilter, ScheduleState
+from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant, mean_before_data
+from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lift import lifted_system
 from heliograph.linear.polynomial import quadratic_system_with_linear_estimate

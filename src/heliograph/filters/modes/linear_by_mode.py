@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.columns import WeightedColumns, rounding_of
-from heliograph.filters.gaussian.belief import process_noise
+from heliograph.filters.gaussian.gaussian_prediction import process_noise
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.types import ArrayLike

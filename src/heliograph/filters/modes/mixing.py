@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.gaussian import Gaussian, from_covariance_by_elimination, merge_mixture, moments_of_mixture
-from heliograph.filters.gaussian.belief import predict_gaussian, process_noise
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, process_noise
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.module import Module, unwritten
 

@@ -12,12 +12,18 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, PlantMotion, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.linear.linear import correct_linear
+from heliograph.filters.linear.linear_filter_state import (
+    LinearBelief,
+    PlantMotion,
+    motion_of_plant,
+    predict_belief,
+    prior_belief,
+)
 from heliograph.filters.modes.arrival_patterns import append_flag
-from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag

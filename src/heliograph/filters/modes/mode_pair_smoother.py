@@ -24,9 +24,9 @@ from heliograph.factors.gaussian import (
     rts_step,
     sum_unexplained,
 )
-from heliograph.filters.gaussian.belief import image_of, process_noise
-from heliograph.filters.gaussian.signal import condition_on_measurement
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import image_of, process_noise
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement
 from heliograph.filters.modes.mixing import normalise_columns
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits

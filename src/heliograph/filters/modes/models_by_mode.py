@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.base import make_sizes
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, models_of

@@ -29,12 +29,12 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import (
+from heliograph.filters.gaussian.gaussian_prediction import (
     second_moments_at_start,
     smoother_step_by_transform,
 )
-from heliograph.filters.gaussian.signal import Signal, condition_on_measurement, noise_behind_gain, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import Signal, condition_on_measurement, noise_behind_gain, signal_of
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.modes.arrival_patterns import SideInformation, pattern_of
 from heliograph.filters.modes.mixing import (
@@ -48,9 +48,9 @@ from heliograph.filters.modes.mixing import (
 from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over

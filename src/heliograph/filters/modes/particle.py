@@ -19,9 +19,9 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import signal_of
 from heliograph.filters.modes.arrival_patterns import SideInformation
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.multiple_model import (
@@ -30,7 +30,7 @@ from heliograph.filters.modes.multiple_model import (
     replicate,
 )
 from heliograph.filters.particles.factory import build_partly_drawn
-from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
+from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
     effective_number,
     fold_in_bits,

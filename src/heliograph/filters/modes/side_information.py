@@ -23,18 +23,18 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import factor_spread, signal_size_at_start
 from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
 from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
-from heliograph.filters.modes.modal import (
+from heliograph.filters.modes.jump_linear_filter import (
     concatenate_modes,
     kron,
     predict_by_mode,
     subtract_mean_output,
     sum_of_modes,
 )
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag

@@ -14,9 +14,8 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, join_columns, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
-from heliograph.filters.gaussian.signal import factor_spread
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
-from heliograph.filters.modes.modal import (
+from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.modes.jump_linear_filter import (
     AbstractJointModalFilter,
     MeasurementModel,
     claim_of_modes,
@@ -30,6 +29,7 @@ from heliograph.filters.modes.modal import (
     separate_modes,
     subtract_mean_output,
 )
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
 from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected_measurement import find_reference
-from heliograph.filters.particles.lanes import filter_particles
 from heliograph.filters.particles.moments import StateSums
+from heliograph.filters.particles.native_particle_loop import filter_particles
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
 from heliograph.model.estimate import Estimate, Innovation

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.words.bit_likelihoods import describe_link, is_free_of_flips
-from heliograph.filters.words.two_hypotheses import keep_two_hypotheses
+from heliograph.filters.words.two_hypothesis_filter import keep_two_hypotheses
 from heliograph.filters.words.word_filter import WordFilter
 from heliograph.filters.wrappers.delay import late_filter
 from heliograph.model.channel import Channel, check_link, perfect

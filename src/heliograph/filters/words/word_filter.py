@@ -15,8 +15,8 @@ from heliograph.factors.columns import WeightedColumns, join_columns, rounding_o
 from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
+from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import Signal, innovation_covariance, signal_of
 from heliograph.filters.words.bit_likelihoods import LinkOfBits
 from heliograph.filters.words.word_moments import WordEffect, find_effect_of_bits, find_effect_of_cell
 from heliograph.filters.words.word_sums import SignalPrior, WordGrid

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal
-from heliograph.filters.words.merged_words import sum_merged, sum_overloads
-from heliograph.filters.words.word_edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
+from heliograph.filters.words.likelihood_at_word_edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
+from heliograph.filters.words.merged_low_bits import sum_merged, sum_overloads
 from heliograph.filters.words.word_sums import (
     FINE,
     REACH,

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.factories import gaussian_filter_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import innovation_covariance, make_received_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
-from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, PolynomialMoments
+from heliograph.filters.gaussian.signal_moments import innovation_covariance, make_received_noise, signal_of
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel

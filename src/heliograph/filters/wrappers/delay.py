@@ -20,9 +20,9 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.signal import link_noise
-from heliograph.filters.linear.belief import LinearBelief, PlantMotion, predict_belief
-from heliograph.filters.linear.plan import PlannedFilter, plan_filter
+from heliograph.filters.gaussian.signal_moments import link_noise
+from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMotion, predict_belief
+from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_link, delayed

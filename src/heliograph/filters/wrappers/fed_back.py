@@ -7,12 +7,12 @@ import jax.numpy as jnp
 
 from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.factories import gaussian_filter_of
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.signal_moments import signal_of
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.fusion.mesh.gains import NodeGains
+from heliograph.fusion.mesh.node_gains import NodeGains
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float, Int

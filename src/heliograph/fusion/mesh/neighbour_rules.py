@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.fusion.intersection import choose_shares_by_trace, intersection_weights
-from heliograph.fusion.mesh.gains import (
+from heliograph.fusion.covariance_intersection import choose_shares_by_trace, intersection_weights
+from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.node_gains import (
     NeighbourEstimates,
     NeighbourWeights,
     NodeGains,
     NodeStep,
     correct_by_information,
 )
-from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import InputError, check_count, fail, scalar, table

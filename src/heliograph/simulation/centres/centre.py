@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
-from heliograph.fusion.all_reports import (
+from heliograph.filters.linear.precomputed_filter import Linearised, LinearStep, linear_step
+from heliograph.fusion.all_reports_fusion import (
     ReportsBelief,
     correct_with_reports,
     estimate_state,

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import Linearised, linearise_step
-from heliograph.fusion.all_reports import AllReports, ReportsBelief
+from heliograph.filters.linear.precomputed_filter import Linearised, linearise_step
+from heliograph.fusion.all_reports_fusion import AllReports, ReportsBelief
 from heliograph.fusion.cross_covariance import (
     ErrorMap,
     ErrorMoments,

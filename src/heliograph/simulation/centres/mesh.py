@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.limits import MESH
+from heliograph.fusion.covariance_intersection import invert
 from heliograph.fusion.cross_covariance import Motion, propagate_state
-from heliograph.fusion.intersection import invert
-from heliograph.fusion.mesh.gains import (
+from heliograph.fusion.mesh.joint_error_covariance import blocks_of
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.mesh.node_gains import (
     NeighbourEstimates,
     NeighbourWeights,
     NodeGains,
     NodeStep,
     gains_of,
 )
-from heliograph.fusion.mesh.joint_error_covariance import blocks_of
-from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate

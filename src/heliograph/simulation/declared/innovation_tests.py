@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.declared.refit import DeclaredRows

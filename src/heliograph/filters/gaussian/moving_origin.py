@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.factors.columns import unit_of
 from heliograph.factors.two_part_mean import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter
+from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, unstack

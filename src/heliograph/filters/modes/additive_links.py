@@ -22,9 +22,8 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, join_columns, rounding_of, side_by_side, triangularise
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
-from heliograph.filters.gaussian.signal import factor_spread
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
-from heliograph.filters.modes.modal import (
+from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.modes.jump_linear_filter import (
     AbstractModalFilter,
     ChannelByMode,
     MeasurementModel,
@@ -36,6 +35,7 @@ from heliograph.filters.modes.modal import (
     observe_modes,
     predict_by_mode,
 )
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation

@@ -29,9 +29,9 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.signal import condition_on_measurement, factor_spread
-from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement, factor_spread
+from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.modes.linear_by_mode import (
     MotionByMode,
     centred_motion,

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.linear.belief import LinearBelief, motion_of_plant
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.linear.linear_filter_state import LinearBelief, motion_of_plant
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant

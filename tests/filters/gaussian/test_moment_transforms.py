@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph.filters.gaussian.transform import Cubature, Linearization
+from heliograph.filters.gaussian.moment_transforms import Cubature, Linearization
 
 MEAN = np.array([0.3, -0.2, 0.5])
 COVARIANCE = np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])

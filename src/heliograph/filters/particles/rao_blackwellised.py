@@ -23,20 +23,26 @@ from heliograph.filters.particles.base import (
     keep_unused,
     relative_to_largest,
 )
-from heliograph.filters.particles.cloud import Cloud, PartlyDrawn, repeat_for_modes, sum_clouds, sum_clouds_apart
-from heliograph.filters.particles.drawn_states import (
-    condition_on_draw,
-    condition_on_leading_states,
-    draw_index,
-    find_certain,
-    slopes_given_drawn,
-)
-from heliograph.filters.particles.expected_mixture import (
+from heliograph.filters.particles.expected_measurement_mixture import (
     ExpectedMixture,
     ReceivedSums,
     compute_mixture_innovation,
     find_base,
     sum_mixtures,
+)
+from heliograph.filters.particles.gaussian_particles import (
+    Cloud,
+    PartlyDrawn,
+    repeat_for_modes,
+    sum_clouds,
+    sum_clouds_apart,
+)
+from heliograph.filters.particles.leading_state_draws import (
+    condition_on_draw,
+    condition_on_leading_states,
+    draw_index,
+    find_certain,
+    slopes_given_drawn,
 )
 from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns

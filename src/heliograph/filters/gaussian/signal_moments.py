@@ -19,7 +19,7 @@ from heliograph.factors.columns import (
 )
 from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.filters.gaussian.transform import AbstractTransform, linear_image
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.modes.modal import modal_filter
+from heliograph.filters.modes.jump_linear_filter import modal_filter
 from tests.follow import follow
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], [[0.1, 0.02], [0.02, 0.2]], [0.5, -1.0], [[1.0, 0.1], [0.1, 0.4]])

@@ -18,7 +18,11 @@ from heliograph.factors.gaussian import (
 )
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
+from heliograph.filters.gaussian.gaussian_prediction import (
+    predict_gaussian,
+    second_moments_at_start,
+    smoother_step_by_transform,
+)
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.words.word_filter import ReceivedWords, WordFilter
 from heliograph.model.estimate import Estimate, Innovation

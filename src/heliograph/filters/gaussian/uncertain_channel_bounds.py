@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.factors.columns import WeightedColumns, decorrelate, join_columns, reciprocal_or_zero
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns
 from heliograph.factors.repeated import triangularise_noise
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, augmented_second_moment, factor_spread
 from heliograph.filters.gaussian.young_scalars import (
     find_trace_minimising_scalars,
     young_fixed_point_map,

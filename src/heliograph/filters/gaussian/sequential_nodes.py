@@ -19,8 +19,8 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.belief import smoother_step_by_transform
 from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian_prediction import smoother_step_by_transform
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import have_same_structure, stack

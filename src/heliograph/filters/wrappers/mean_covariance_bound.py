@@ -11,9 +11,9 @@ import numpy as np
 
 from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.belief import LinearBelief
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.filters.linear.linear_filter_state import LinearBelief
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, fail, show_value
 from heliograph.numerics.float64 import compile_in_float64

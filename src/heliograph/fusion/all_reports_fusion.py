@@ -16,7 +16,7 @@ from heliograph.factors.columns import (
     square_root,
 )
 from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
-from heliograph.filters.gaussian.signal import augmented_second_moment
+from heliograph.filters.gaussian.signal_moments import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
 from heliograph.fusion.quantizer import widen_by_quantization

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at_each_step
 from heliograph.model.sensor import AbstractSensor, AnySensor

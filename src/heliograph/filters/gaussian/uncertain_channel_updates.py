@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.gaussian import Gaussian, from_covariance
-from heliograph.filters.gaussian.bounds import (
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, condition_on_received
+from heliograph.filters.gaussian.uncertain_channel_bounds import (
     Scalars,
     as_scalars,
     keep_where_unchanged,
@@ -20,7 +21,6 @@ from heliograph.filters.gaussian.bounds import (
     observe_by_zero_mean,
     scalars_as_array,
 )
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable, unwritten

@@ -12,9 +12,13 @@ from heliograph.factors.columns import WeightedColumns, eliminate, join_columns,
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
-from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start, smoother_step_by_transform
-from heliograph.filters.gaussian.signal import Signal, factor_spread, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import (
+    predict_gaussian,
+    second_moments_at_start,
+    smoother_step_by_transform,
+)
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, signal_of
 from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag
 from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
 from heliograph.filters.smoother_step import SmootherStep, StepTrace

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.words.word_edges import ROOT_TWO_PI, signed_tail_and_density
+from heliograph.filters.words.likelihood_at_word_edges import ROOT_TWO_PI, signed_tail_and_density
 from heliograph.filters.words.word_sums import (
     FINE,
     REACH,

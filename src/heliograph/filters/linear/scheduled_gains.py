@@ -11,9 +11,9 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, factor_covariances, join_columns, rounding_of, triangularise
 from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.gaussian.signal import condition_on_measurement
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation

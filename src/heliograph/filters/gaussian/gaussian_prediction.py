@@ -25,7 +25,7 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.filters.wrappers.state_limits import accept_limits

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
-from heliograph.filters.gaussian.belief import process_noise
+from heliograph.filters.gaussian.gaussian_prediction import process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.traced import library

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.gaussian import Gaussian
-from heliograph.filters.states import MomentSlopes
+from heliograph.filters.gaussians_in_states import MomentSlopes
 from heliograph.model.over_time import at
 from heliograph.numerics.linalg import psd_solve, symmetric
 from heliograph.numerics.types import Array

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights
 from heliograph.numerics.linalg import factor, psd_solve, rounding, solver, symmetric
 from heliograph.numerics.types import Float
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from typing_extensions import TypeAliasType
 
-from heliograph.h_infinity.interval import Interval, UnknownError, bound_program
+from heliograph.h_infinity.interval_arithmetic import Interval, UnknownError, bound_program
 from heliograph.numerics.check import array, check_seed, error_text, fail, flag, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compile_in_float64
