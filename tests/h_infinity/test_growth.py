@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.h_infinity import certify_level, check_growth
 from heliograph.h_infinity.interval_arithmetic import ARITHMETIC, Interval, bound_program
-from heliograph.h_infinity.lipschitz_check import slope_bound
+from heliograph.h_infinity.lipschitz_check import prove_slope_bound
 
 REFUTED = {
     "a slope above it": (lambda x: 0.5 * x + jnp.array([1e-5 * jnp.sin(1e5 * x[0])]), 0.7, "slope 1.5"),
@@ -93,7 +93,7 @@ def test_values_are_inside_their_intervals():
     ids=["a jump", "a sign", "an operation"],
 )
 def test_what_cannot_be_followed_is_assumed_and_says_so(function, reason):
-    result = slope_bound(function, np.array([-1.0]), np.array([1.0]), 1.0)
+    result = prove_slope_bound(function, np.array([-1.0]), np.array([1.0]), 1.0)
     assert result.value == np.inf and reason in result.reason
 
 
@@ -103,7 +103,7 @@ def test_a_stopped_slope_proves_nothing():
 
     finding = check_growth(spike, 0.5, [-1.0], [1.0])
     assert not finding.refuted and not finding.proved and "a slope that is stopped" in finding.text
-    assert slope_bound(lambda x: x * jax.lax.stop_gradient(2.0), -np.ones(1), np.ones(1), 2.0).value <= 2 + 1e-9
+    assert prove_slope_bound(lambda x: x * jax.lax.stop_gradient(2.0), -np.ones(1), np.ones(1), 2.0).value <= 2 + 1e-9
 
 
 @pytest.mark.parametrize(

@@ -346,7 +346,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(predict, AbstractFilter.check_input, call_with_inputs)
+    return _compile_with_checks(predict, AbstractFilter.check_input, call_with_inputs)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -355,7 +355,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(correct, AbstractFilter.check_measurement, call_with_state)
+    return _compile_with_checks(correct, AbstractFilter.check_measurement, call_with_state)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -373,7 +373,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
     return cast(Callable[P, R], call)
 
 
-def _check_calls(
+def _compile_with_checks(
     function: Callable[P, R],
     check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
     call_checked: Callable[..., R],

@@ -25,12 +25,12 @@ from heliograph.filters.gaussians_in_states import beside_gaussians, find_equal_
 from heliograph.filters.linear_recursion import (
     FilterRecursion,
     Recursion,
-    linear_start,
+    initial_state_if_linear,
     scan_chunk,
     state_after_rows,
     sum_chunk,
 )
-from heliograph.filters.row_windows import Which, join_results, take, take_windows, take_windows_in_parts
+from heliograph.filters.row_windows import Which, run_and_join, take, take_windows, take_windows_in_parts
 from heliograph.filters.settled_covariance import (
     CompleteBlocks,
     SettledState,
@@ -100,7 +100,7 @@ def filter_in_chunks(
         state: before the first row; that before any unless given.
         begin: number of the first row.
     """
-    start = linear_start(filter) if is_long(len(z)) else None
+    start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
     rows = FilterRecursion(filter, output, np.asarray(begin))
@@ -109,7 +109,7 @@ def filter_in_chunks(
 
 def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:
     """Filter rows as `filter_in_chunks` does; return sums over all rows of what is kept of each, or None."""
-    start = linear_start(filter) if is_long(len(z)) else None
+    start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
     whole = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
@@ -148,7 +148,7 @@ def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> Chun
         whole = complete.cover(first, lengths.chunk)
         settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
         for law in [None] if settled is None else [settled, None]:
-            states = _find_start_states(WarmUp(recursion, rows, complete, law), start, first[1:])
+            states = _find_start_states(WarmUpRun(recursion, rows, complete, law), start, first[1:])
             if states is not None:
                 covered = whole & (False if law is None else law.covers(states))
                 return ChunkStarts(
@@ -157,7 +157,7 @@ def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> Chun
     return None
 
 
-def _predict_moments_by_block(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
+def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
     """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each.
 
     `rows` (block, row, ...), of which the first has the number `first`.
@@ -177,7 +177,7 @@ def _predict_moments_by_block(recursion: Recursion, state: PyTree, rows: PyTree,
     return beside_gaussians(last), before
 
 
-class WarmUp(NamedTuple):
+class WarmUpRun(NamedTuple):
     """Computes the state before a row from one some rows earlier, for many rows side by side.
 
     `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
@@ -228,7 +228,7 @@ class WarmUp(NamedTuple):
         return None if choice.code is None else choice.results()
 
 
-def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
+def _find_start_states(reach: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
     """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
 
     What a state holds beside its Gaussians, moments before any data, may never forget: then it is computed of all rows.
@@ -237,7 +237,7 @@ def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " ch
     starts = repeat_state(start, len(jax.tree.leaves(reach.rows)[0]) // reach.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(reach, starts, first)
     if forgets is False and jax.tree.leaves(beside_gaussians(start)) and reach.settled is None:
-        starts = _with_moments_before_data(reach.recursion, start, reach.rows, reach.ahead)
+        starts = _replace_data_free_parts(reach.recursion, start, reach.rows, reach.ahead)
         forgets = starts is not None and _start_is_forgotten(reach, starts, first)
     if not forgets:
         return None
@@ -245,7 +245,7 @@ def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " ch
     return jax.tree.map(lambda one, others: np.concatenate([one[None], others]), start, reached)
 
 
-def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
+def _start_is_forgotten(reach: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
     """Return whether a wrong start is forgotten `ahead` rows later; None without native code.
 
     This is tried before at most PROBES chunks, and must hold for more than half of them. It is forgotten where the
@@ -261,14 +261,14 @@ def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " 
     return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
 
 
-def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
+def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
     """Return starts, one each `ahead` rows, with what a state holds there beside its Gaussians."""
     # BLOCKS blocks of `ahead` rows at a time.
     parts, state, size = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
         blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
                               take_windows(rows, np.array([begin]), size))  # fmt: skip
-        choice = choose_code(_predict_moments_by_block, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
+        choice = choose_code(_predict_data_free_parts, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
@@ -315,7 +315,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
             (recursion, take(states, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
         ]
-        return join_results(programs.full, parts, [False, True, True, True, False])
+        return run_and_join(programs.full, parts, [False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
         """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
@@ -324,7 +324,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
             (recursion, settled, take(means, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first, length)
         ]
-        joined = join_results(programs.settled, parts, [False, False, True, True, True, False])
+        joined = run_and_join(programs.settled, parts, [False, False, True, True, True, False])
         return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_means_where_settled(begun, scan, scan_means)

@@ -40,7 +40,7 @@ class FilterRecursion(Recursion):
         return after, self.output(self.filter, after, innovation, number)
 
 
-def linear_start(filter: Any) -> PyTree | None:
+def initial_state_if_linear(filter: Any) -> PyTree | None:
     """Return the state of a filter before any row; None of one of which more than the mean depends on data."""
     start = jax.tree.map(np.asarray, filter.init()) if getattr(filter, "is_linear", False) else ()
     return start if gaussians_of(start) else None
@@ -55,7 +55,7 @@ def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, 
         after, output = recursion.step(state, data, k)
         return select_state(k < count, after, state), output
 
-    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))
 
 
 def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
@@ -79,7 +79,7 @@ def sum_rows(
         after, output = step(state, data, k)
         return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None
 
-    numbers = number_rows(rows, first)
+    numbers = make_row_numbers(rows, first)
     shapes = jax.eval_shape(lambda: step(state, jax.tree.map(lambda leaf: leaf[0], rows), numbers[0])[1])
     zero_sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return jax.lax.scan(body, (state, zero_sums), (rows, numbers))[0]
@@ -92,9 +92,9 @@ def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: A
         """Step over one row."""
         return recursion.step(state, *row)[0], None
 
-    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, number_rows(rows, first)))[0]
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))[0]
 
 
-def number_rows(rows: PyTree, first: Array) -> Array:
+def make_row_numbers(rows: PyTree, first: Array) -> Array:
     """Return the numbers of rows, from `first` on."""
     return first + jnp.arange(len(jax.tree.leaves(rows)[0]))

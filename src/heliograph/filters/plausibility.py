@@ -195,7 +195,7 @@ def judge_step(
     is_sound = _is_sound_correction(after, claim, prior)
     loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
     by_correction = loses_soundness | _overflows(state_prior, state_after)
-    loses_soundness = _is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)
+    loses_soundness = _are_finite(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
     # The reason. Where several apply, prediction goes before far, that before unsound, and that before excluded.
     reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
@@ -271,7 +271,7 @@ def _squared_distance_terms_in_turn(
     return jnp.where(used, squares, 0.0), used & determined
 
 
-def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
+def _are_finite(estimates: Estimate, claim: Claim) -> jax.Array:
     """Return whether all means are finite numbers, and the covariances too where one is claimed."""
     finite = ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.mean)))
     return finite if claim == "none" else finite & ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.covariance)))
@@ -280,22 +280,22 @@ def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
 def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
     """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before."""
     if claim == "none":
-        return _is_finite_number(estimates, claim)
+        return _are_finite(estimates, claim)
     variances_after = jnp.diagonal(jnp.asarray(estimates.covariance))
     variances_before = jnp.diagonal(jnp.asarray(before.covariance))
     # The rounding of a difference is as large as what it was taken from.
     size = jnp.where(jnp.isfinite(variances_before), jnp.abs(variances_before), 0.0)
     rounded = rounding(NEGATIVE_TOLERANCE, variances_after) * size
-    return _is_finite_number(estimates, claim) & ~jnp.any(variances_after < -rounded)
+    return _are_finite(estimates, claim) & ~jnp.any(variances_after < -rounded)
 
 
 def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
     """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it."""
     if claim == "none":
-        return _is_finite_number(prior, claim)
+        return _are_finite(prior, claim)
     variances = jnp.diagonal(jnp.asarray(prior.covariance))
     largest = jnp.max(jnp.abs(variances), initial=0.0)
-    return _is_finite_number(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
+    return _are_finite(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:

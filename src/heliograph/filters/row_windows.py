@@ -60,7 +60,7 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     return jax.tree.map(take_from, rows)
 
 
-def join_results(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs: Sequence[bool]) -> PyTree:
+def run_and_join(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs: Sequence[bool]) -> PyTree:
     """Return the results of runs of several lists of arguments in the same arrays; None without native code.
 
     `differs` says of which arguments each run has its own.

@@ -152,23 +152,23 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         u: inputs (rows, inputs); None of a filter without any.
         after: result of the rows before these, from whose last state the filter goes on; None for the first rows.
     """
-    before = None if after is None else _find_origin(filter, after)
+    before = None if after is None else _find_origin_of_earlier_result(filter, after)
     begin = 0 if before is None else int(before.step)
     rows_z, rows_u = check_data(filter, z, u, begin)
     dates = find_common_dates(_name_tables(z, u))
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
-        _check_later(before, dates)
+        _check_dates_increase(before, dates)
     start = () if before is None else (before.state, np.asarray(begin))
     # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
     # return None where they do not apply.
-    result = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
+    result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)
     result = result or filter.filter_rows(rows_z, rows_u, *start)
     state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
     mean, covariance, innovation, modes, counts = outputs
     _warn_of_lost_estimate(filter, mean, begin)
     if counts is not None:
-        _warn_of_particles(counts, innovation.log_likelihood, begin)
+        _warn_of_few_particles(counts, innovation.log_likelihood, begin)
     return Filtered(
         means=mean,
         covariances=covariance,
@@ -177,13 +177,13 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
         log_likelihoods=innovation.log_likelihood,
         claim=filter.claim,
         weights=innovation.weight,
-        origin=_describe_end(filter, state, begin + len(rows_z), rows_u, dates),
+        origin=_make_end_origin(filter, state, begin + len(rows_z), rows_u, dates),
         modes=modes,
         effective_numbers=counts,
     )
 
 
-def _describe_end(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
+def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
     """Return where a record ends, from which a later call or a forecast goes on.
 
     Args:
@@ -215,7 +215,7 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
         warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=4)
 
 
-def _find_origin(filter: SteppedFilter, after: Filtered) -> Origin:
+def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
     """Return where an earlier result of this filter ended; raise ValueError unless it is one, with its last state."""
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin
@@ -226,13 +226,13 @@ def _find_origin(filter: SteppedFilter, after: Filtered) -> Origin:
     return origin
 
 
-def _check_later(before: Origin, dates: np.ndarray) -> None:
+def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
     """Check that dates of rows are behind that of the last row before them, where it has one."""
     if isinstance(before.time, np.datetime64) and not dates[0] > before.time:
         raise fail("measurements", f"rows behind {before.time}, the last one before them", str(dates[0]))
 
 
-def _warn_of_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
+def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
     """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before."""
     unused = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
     few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
@@ -249,10 +249,10 @@ def _compute_filtered(
     filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> PyTree:
     """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
-    return scan_with_last_state(filter, z, u, partial(_collect_row, filter), state, begin)
+    return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
 
 
-def _collect_row(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
     """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
     estimate = filter.after_step(state, k)
     return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)

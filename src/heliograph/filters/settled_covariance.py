@@ -19,7 +19,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.filters.gaussians_in_states import ROUNDING, find_equal_states, means_of, select_state, with_means
-from heliograph.filters.linear_recursion import Recursion, number_rows, sum_rows
+from heliograph.filters.linear_recursion import Recursion, make_row_numbers, sum_rows
 from heliograph.filters.row_windows import take
 from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
@@ -174,7 +174,7 @@ def scan_settled_rows(
         after, outputs = step_settled(recursion, settled.state, means, data, k)
         return select_state(k < count, means_of(after), means), settled.varying_of(outputs)
 
-    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, make_row_numbers(rows, first)))
 
 
 def sum_settled_rows(
@@ -199,7 +199,7 @@ def means_after_settled_rows(
         """Step over one row."""
         return means_of(step_settled(recursion, settled.state, means, *row)[0]), None
 
-    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, make_row_numbers(rows, first)))[0]
 
 
 class CompleteBlocks(NamedTuple):

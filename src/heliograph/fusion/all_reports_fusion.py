@@ -136,7 +136,7 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
     noise = join_columns(
         columns_of(step.process).through(step.of_noise),
         _factor_measurement_noise(step.gain, step.received).through(np.eye(size, nodes * n, -n)),
-        rounding_of(jnp.tile(_square_mean(errors), 1 + nodes)),
+        rounding_of(jnp.tile(_find_second_moments_of_state(errors), 1 + nodes)),
     )
     # Past reports move on by one place, without a noise.
     line = ReportMap(step.transition)
@@ -147,7 +147,7 @@ def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportMo
     )
 
 
-def _square_mean(errors: ErrorMoments) -> Float[jax.Array, " n"]:
+def _find_second_moments_of_state(errors: ErrorMoments) -> Float[jax.Array, " n"]:
     """Return E[x_i^2] of each component of the plant's state, before any data (n,)."""
     return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
 
@@ -182,8 +182,8 @@ def correct_with_reports(
     spill = None
     if state.spill is not None:
         keep = jnp.eye(len(x.mean)) - gain @ output
-        push = _cauchy_bound(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
-        spill = symmetric(_bound_sum(propagate_by_mode(keep, state.spill, 0.0), push))
+        push = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+        spill = symmetric(_bound_by_young(propagate_by_mode(keep, state.spill, 0.0), push))
     law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
     return ReportsBelief(after, past, spill), law
 
@@ -207,7 +207,7 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     """Return the estimate of x, with the covariance of its error or a bound on it."""
     x = take_leading(state.gaussian, n)
     mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
-    return mean, covariance if state.spill is None else _bound_sum(covariance, state.spill[:n, :n])
+    return mean, covariance if state.spill is None else _bound_by_young(covariance, state.spill[:n, :n])
 
 
 def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
@@ -271,13 +271,13 @@ def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Ar
     return full.reshape(len(items) * rows, len(items) * columns)
 
 
-def _cauchy_bound(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
+def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
     """Return B s diag(D) B', which bounds (B mu)(B mu)' for |mu| <= D; s = sum D over what B uses (Cauchy)."""
     used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
     return jnp.sum(used) * (into * used) @ into.T
 
 
-def _bound_sum(a: jax.Array, b: jax.Array) -> jax.Array:
+def _bound_by_young(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young)."""
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     are_positive = (r > 0) & (s > 0)

@@ -33,7 +33,7 @@ def intersect_covariances(
     return means[0] + covariance @ differences, covariance
 
 
-class _Progress(NamedTuple):
+class _InteriorPointState(NamedTuple):
     """State of the interior point method: weights w, multipliers s of w >= 0, whether to go on, count of steps."""
 
     weights: jax.Array
@@ -52,29 +52,29 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
     # In a unit in which traces are 1 on average: the first multipliers below are of that size.
     scaled = information / (jnp.sum(jax.vmap(jnp.trace)(information)) / count)
 
-    def improve_weights(progress: _Progress) -> _Progress:
+    def improve_weights(progress: _InteriorPointState) -> _InteriorPointState:
         """Take one Newton step, unless the certificate says that the weights are good enough."""
         w, slack = progress.weights, progress.slack
         trace, gradient, hessian = _trace_derivatives(scaled, w)
         # At the optimum s = g - min g: with a tenth of the trace added, the first multipliers are positive.
         slack = jnp.where(progress.iteration == 0, gradient - jnp.min(gradient) + 0.1 * trace, slack)
-        new_w, new_slack = _take_newton_step(_InteriorPoint(w, slack, gradient, hessian))
+        new_w, new_slack = _take_newton_step(_PointWithDerivatives(w, slack, gradient, hessian))
         # The certificate of the docstring: max_k tr(P J_k P) is above tr P by more than GAP tr P.
         is_unfinished = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
         w, slack = jnp.where(is_unfinished, new_w, w), jnp.where(is_unfinished, new_slack, slack)
-        return _Progress(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
+        return _InteriorPointState(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
 
-    def goes_on(progress: _Progress) -> jax.Array:
+    def goes_on(progress: _InteriorPointState) -> jax.Array:
         """Return whether another step is to be taken."""
         return progress.goes_on & (progress.iteration < ITERATIONS)
 
     # From equal weights, which are inside the simplex.
     w = jnp.full(count, 1 / count)
-    start = _Progress(weights=w, slack=jnp.zeros_like(w), goes_on=jnp.asarray(True), iteration=jnp.asarray(0))
+    start = _InteriorPointState(weights=w, slack=jnp.zeros_like(w), goes_on=jnp.asarray(True), iteration=jnp.asarray(0))
     return jnp.asarray(jax.lax.while_loop(goes_on, improve_weights, start).weights)
 
 
-class _InteriorPoint(NamedTuple):
+class _PointWithDerivatives(NamedTuple):
     """Weights and their multipliers; the gradient of tr P and its Hessian."""
 
     weights: Float[jax.Array, " count"]
@@ -99,7 +99,7 @@ def _sum_weighted(w: Float[jax.Array, " count"], information: Float[jax.Array, "
     return jnp.einsum("k,kab->ab", w, information)
 
 
-def _take_newton_step(point: _InteriorPoint) -> tuple[jax.Array, jax.Array]:
+def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Array]:
     """Return weights w and multipliers s after one Newton step for g - s + m 1 = 0, sum w = 1, w s = target.
 
     g is the gradient, s the multipliers of w >= 0, m that of the sum. The target follows from where the step with

@@ -22,7 +22,7 @@ RIDGE = 1e-8  # share of a variance that each estimate is taken to have as indep
 Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
-def _check_joint(weights: Weights) -> Weights:
+def _with_joint_check(weights: Weights) -> Weights:
     """Decorate weights so that they refuse an array that is no joint covariance."""
 
     @wraps(weights)
@@ -36,7 +36,7 @@ def _check_joint(weights: Weights) -> Weights:
     return call
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
@@ -99,7 +99,7 @@ def solve_factored_weights(
     return jnp.asarray(unbiased.reshape(n, nodes, n))
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
@@ -110,7 +110,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     return _weigh_components(matrix_weights, jnp.asarray(joint))
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute scalar weights: one number per node, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).

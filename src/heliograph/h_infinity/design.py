@@ -104,7 +104,7 @@ def recursive_design(
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _check_initial_weight(initial, system.states)
-    recursion = _Recursion(system, objective, solver, flag("separate", separate))
+    recursion = _RecursiveDesigner(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
     # At the given level, if there is one and it works; else the smallest level, by bisection.
     design = None if target is None else recursion.run(target, start)
@@ -204,7 +204,7 @@ def _find_first_failing(
     return None
 
 
-class _Recursion:
+class _RecursiveDesigner:
     """Recursive design over the horizon: one problem a step, compiled again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):

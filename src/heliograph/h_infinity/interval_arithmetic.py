@@ -23,7 +23,7 @@ MOVES = (
 )  # fmt: skip
 
 
-class UnknownError(Exception):
+class NoIntervalError(Exception):
     """An operation outside of what is known here, or a decision that the box leaves open."""
 
 
@@ -44,7 +44,7 @@ def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], contin
             stopped gradient, which its derivative lacks.
 
     Raises:
-        UnknownError: an operation that is not known here, or that is refused.
+        NoIntervalError: an operation that is not known here, or that is refused.
     """
     values: dict[core.Var, Interval] = {}
 
@@ -63,7 +63,7 @@ def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], contin
         elif name == "mul" and equation.invars[0] is equation.invars[1]:  # x x is never below 0, as x y may be
             results = [_bound_square(inputs[0])]
         elif name == "stop_gradient" and continuous and not np.array_equal(*inputs[0]):  # no point
-            raise UnknownError("a slope that is stopped")
+            raise NoIntervalError("a slope that is stopped")
         # What moves entries about, and whole numbers, are not rounded: the ends' results are the ends.
         elif name in MOVES or all(a.low.dtype.kind in "iu" for a in inputs):
             results = _apply_to_ends(equation, inputs)
@@ -94,7 +94,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
     `continuous`: refuse a comparison or sign whose outcome the intervals leave open.
 
     Raises:
-        UnknownError: an operation that is not known here, or that is refused.
+        NoIntervalError: an operation that is not known here, or that is refused.
     """
     name, params = equation.primitive.name, equation.params
     # Arithmetic, and functions of a single number.
@@ -108,7 +108,7 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
         case "convert_element_type":
             dtype, is_point = np.dtype(params["new_dtype"]), np.array_equal(x[0].low, x[0].high)
             if dtype.kind not in "fb" and not is_point:  # to whole numbers: a jump
-                raise UnknownError("a number made whole")
+                raise NoIntervalError("a number made whole")
             return Interval(x[0].low.astype(dtype), x[0].high.astype(dtype))
         case "reduce_sum":
             return _sum_intervals(x[0], tuple(params["axes"]))
@@ -129,13 +129,13 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
             return Interval(~x[0].high, ~x[0].low)
         case "select_n":
             return _select_case(x)
-    raise UnknownError(name)
+    raise NoIntervalError(name)
 
 
 def _check_decided(interval: Interval, continuous: bool) -> Interval:
     """Return the interval of a decision, refused where it is open and the function has to be continuous."""
     if continuous and not np.array_equal(interval.low, interval.high):
-        raise UnknownError("a decision that depends on where in the region x is")
+        raise NoIntervalError("a decision that depends on where in the region x is")
     return interval
 
 
@@ -145,7 +145,7 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
     Whole numbers among its arguments are places, which have to be certain.
     """
     if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
-        raise UnknownError("a place that depends on x")
+        raise NoIntervalError("a place that depends on x")
     lows, highs = _apply_to_numbers(equation, [a.low for a in x]), _apply_to_numbers(equation, [a.high for a in x])
     return [Interval(low, high) for low, high in zip(lows, highs, strict=True)]
 

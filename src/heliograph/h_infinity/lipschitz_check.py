@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from typing_extensions import TypeAliasType
 
-from heliograph.h_infinity.interval_arithmetic import Interval, UnknownError, bound_program
+from heliograph.h_infinity.interval_arithmetic import Interval, NoIntervalError, bound_program
 from heliograph.numerics.check import array, check_seed, error_text, fail, flag, scalar
 from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compile_in_float64
@@ -150,7 +150,7 @@ def check_growth(
     _check_function(check_callable("function", function, "the state"), bottom)
     if not differences and (np.any(bottom > 0) or np.any(top < 0)):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
-    meter, random = _SlopeMeter(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    meter, random = _LipschitzMeter(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
     if differences:
         points, pairs = _search_slopes_and_pairs(meter, starts, bottom, top, random)
@@ -181,7 +181,7 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
     return bottom, top
 
 
-class _SlopeMeter:
+class _LipschitzMeter:
     """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
 
     def __init__(self, function: Function, width: float):
@@ -220,7 +220,7 @@ def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, 
 
 
 def _search_slopes_and_pairs(
-    meter: _SlopeMeter,
+    meter: _LipschitzMeter,
     starts: Float[np.ndarray, "starts n"],
     low: Float[np.ndarray, "n"],
     high: Float[np.ndarray, "n"],
@@ -256,7 +256,7 @@ def _make_finding(
     constant: float,
     low: np.ndarray,
     high: np.ndarray,
-    meter: _SlopeMeter,
+    meter: _LipschitzMeter,
     points: np.ndarray,
     pairs: np.ndarray,
     differences: bool,
@@ -292,7 +292,7 @@ def _make_finding(
     )
     if finding.refuted:
         return finding
-    bound = slope_bound(meter.function, low, high, finding.limit)
+    bound = prove_slope_bound(meter.function, low, high, finding.limit)
     return finding._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 
@@ -329,7 +329,7 @@ class SlopeBound(NamedTuple):
     reason: str
 
 
-def slope_bound(
+def prove_slope_bound(
     function: Callable[[jax.Array], jax.Array], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> SlopeBound:
     """Return a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
@@ -347,7 +347,7 @@ def slope_bound(
             bound_program(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
             slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
             return SlopeBound(_sharpen_bound(slopes, low, high, goal), "")
-    except UnknownError as reason:
+    except NoIntervalError as reason:
         return SlopeBound(np.inf, f"cannot follow {reason}")
 
 

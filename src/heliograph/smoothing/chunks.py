@@ -23,7 +23,7 @@ from heliograph.filters.chunks import (
     scan_means_where_settled,
 )
 from heliograph.filters.gaussians_in_states import find_equal_states, select_state
-from heliograph.filters.linear_recursion import linear_start, scan_chunk
+from heliograph.filters.linear_recursion import initial_state_if_linear, scan_chunk
 from heliograph.filters.row_windows import Which, take, take_windows
 from heliograph.filters.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
@@ -48,7 +48,7 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
     """
-    start, rows = linear_start(filter), (np.asarray(z), np.asarray(u))
+    start, rows = initial_state_if_linear(filter), (np.asarray(z), np.asarray(u))
     if start is None:
         return None
     with jax.enable_x64(True):

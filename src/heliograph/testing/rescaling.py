@@ -18,7 +18,7 @@ from heliograph.filters.linear.polynomial import PolynomialFilter
 from heliograph.filters.linear.scheduled_gains import LinearSystemFilter
 from heliograph.filters.linear.unconditional_mean import UnconditionalMean
 from heliograph.filters.modes.additive_links import AdditiveModalFilter
-from heliograph.filters.modes.arrival_patterns import SideInformation
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
 from heliograph.filters.modes.finite_support_filter import AtomCombinations, MixtureFilter
 from heliograph.filters.modes.jump_linear_filter import ChannelByMode, ModalFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
@@ -37,7 +37,7 @@ from heliograph.random_affine.moments.quadratic_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
-Modes = TypeVar("Modes", SideInformation, ChannelByMode)  # a channel at one step, mode by mode
+Modes = TypeVar("Modes", ChannelByPattern, ChannelByMode)  # a channel at one step, mode by mode
 
 # Filters that hold the plant and the sensor at the ends of a channel.
 WithEnds = (

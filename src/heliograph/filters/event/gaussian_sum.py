@@ -67,7 +67,7 @@ def safe_log(x: jax.Array) -> jax.Array:
     return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
-def log_total(log_weight: jax.Array) -> jax.Array:
+def log_total_weight(log_weight: jax.Array) -> jax.Array:
     """Return log of the sum of weights; -inf where all are 0."""
     top = jnp.max(log_weight)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
@@ -119,7 +119,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
 
     def merge_group(parts: GaussianSum) -> GaussianSum:
         """Merge one group; where no component has weight, all count alike."""
-        total = log_total(parts.log_weight)
+        total = log_total_weight(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
         return GaussianSum(total, merge_mixture(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
@@ -131,7 +131,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
     return few
 
 
-def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
+def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
     """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
 
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.

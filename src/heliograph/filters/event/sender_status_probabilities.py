@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 
-class SilentLabels(NamedTuple):
+class SilenceByCause(NamedTuple):
     """A sender's label (K, M, A, C), split by why no value came, before it is known where y - r lies.
 
     unsent: nothing was sent, if |y - r| <= delta; dropped: sent and lost, if |y - r| > delta; forced: sent wherever y
@@ -21,7 +21,7 @@ class SilentLabels(NamedTuple):
     forced: jax.Array
 
 
-def relabel_sent(label: jax.Array, lost: bool) -> jax.Array:
+def status_after_sending(label: jax.Array, lost: bool) -> jax.Array:
     """Return a sender's label (K, M, A, C) after a transmission: 0 steps since then, and one more lost or none.
 
     The last entry of C counts all larger numbers too; with C = 1 losses are not counted.

@@ -18,8 +18,8 @@ from heliograph.filters.gaussian.gaussian_prediction import (
     smoother_step_by_transform,
 )
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
-from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, signal_of
-from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag
+from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, find_signal_moments
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag
 from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal
@@ -54,7 +54,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     trigger: StochasticTrigger | Periodic
     initial: Float[Array, " M"]
     transform: AbstractTransform
@@ -101,7 +101,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         count = self.received - self.trigger.side_information(self.outputs)
         values, down = z[:count], z[count:]
         prior = state.gaussian
-        signal = signal_of(plant, sensor, self.transform, prior, second_moments_at_start(self.plant))
+        signal = find_signal_moments(plant, sensor, self.transform, prior, second_moments_at_start(self.plant))
 
         # A value: the update in each mode of the link, joined.
         modes = len(state.law)
@@ -114,7 +114,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         by_silence = self._mix_silence_and_outage(prior, silent, state.law, channel, down)
         # Of a value: that it was sent says something too, behind a trigger that sends by chance.
         if isinstance(self.trigger, StochasticTrigger):
-            link = self._average_link(channel, state.law)
+            link = self._average_link_moments(channel, state.law)
             innovation = self._condition_on_sending(innovation, link, signal, state.reference, log_silent)
         # Which of the two it is, with its likelihood; silence that the rule forbids has the likelihood FLOOR.
         arrived = jnp.any(~jnp.isnan(values))
@@ -142,7 +142,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
         Args:
             innovation: of the value, as if it were sent always.
-            link: mean gain and spread, as `_average_link` returns.
+            link: mean gain and spread, as `_average_link_moments` returns.
             signal: moments of y before the value.
             reference: r, with which the sender compares y (m,).
             log_silent: log P(silent) before the value.
@@ -150,7 +150,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         # How z's predicted moments change by it; where a component is missing nothing does, and any numbers will do.
         value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
-        shift, change = self._change_by_sending(link, signal, reference, log_silent)
+        shift, change = self._find_moment_changes_given_sent(link, signal, reference, log_silent)
         complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
         # p(z | sent) is in proportion to p(z) P(sent | z).
         gain, _ = link
@@ -162,7 +162,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         )
 
     def _mix_silence_and_outage(
-        self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: SideInformation, down: jax.Array
+        self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: ChannelByPattern, down: jax.Array
     ) -> GaussianSum:
         """Mix the update by silence (link up) with the prior (link down), by their weights given that no value came."""
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
@@ -177,7 +177,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             parts += [part.scale_weights(jnp.where(is_down, 0.0, -jnp.inf)) for part in by_outage]
         return merge_groups(concatenate(parts))
 
-    def _average_link(self, channel: SideInformation, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives."""
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
@@ -185,7 +185,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         )
         return gain[:, :-1], spread
 
-    def _change_by_sending(
+    def _find_moment_changes_given_sent(
         self, link: tuple[jax.Array, jax.Array], signal: Signal, reference: jax.Array, log_silent: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return how z's predicted mean (m,) and covariance (m, m) change given that it was sent: far from r.

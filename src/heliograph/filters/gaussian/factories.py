@@ -3,7 +3,7 @@
 from heliograph.filters.base import make_sizes
 from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
-from heliograph.filters.gaussian.gaussian_prediction import prior_of
+from heliograph.filters.gaussian.gaussian_prediction import choose_initial_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
@@ -51,7 +51,7 @@ def _make_gaussian_filter(
     channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
-    mean, covariance, prior_given = prior_of(start, initial_mean, initial_covariance)
+    mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     premise = Premise(plant, sensor, channel)  # what the claim rests on: the channel with its memory
     # Moments of the channel without its memory: where that matters, the described channel is not the true one.
     trusted = trusted and not memory_matters(channel)
@@ -212,7 +212,7 @@ def mean_gain_filter(
     )
 
 
-def gaussian_filter_of(
+def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
     """Return the Gaussian filter that another one stands on, refused behind a link of which anything is told.

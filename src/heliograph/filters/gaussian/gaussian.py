@@ -8,13 +8,13 @@ from heliograph.factors.gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
 from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.moving_origin import center_filter
+from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
 from heliograph.filters.gaussian.signal_moments import (
     ArrivedInnovation,
     Signal,
     condition_on_measurement,
+    find_signal_moments,
     make_received_noise,
-    signal_of,
 )
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.linear.precomputed_filter import plan_filter
@@ -60,7 +60,7 @@ class GaussianFilter(AbstractBeliefFilter):
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of the sensor's signal y at step k, from the state before its measurement."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
-        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
+        return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     @compile_in_float64
     def expect_signals(
@@ -107,7 +107,7 @@ class GaussianFilter(AbstractBeliefFilter):
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
-        return center_filter(self)
+        return make_moving_origin_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

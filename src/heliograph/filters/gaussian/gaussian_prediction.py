@@ -83,14 +83,14 @@ class AbstractBeliefFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self, step, self)
 
 
-class HasStart(Protocol):
+class HasInitialMoments(Protocol):
     """What has a law of the first state: a plant, or a filter that starts from another law."""
 
     initial_mean: Array
     initial_covariance: Array
 
 
-def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> Float[jax.Array, " n"]:
+def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = None) -> Float[jax.Array, " n"]:
     """Return E[x_i^2] at the start plus Var w_i of a step, (n,): how large the numbers are that rounding acts on.
 
     `start`: whose law of the first state counts, by default the plant's; of a law that is partly unknown, the known
@@ -109,13 +109,13 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
     return jnp.asarray(size)
 
 
-def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
+def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
     """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     return triangularise(join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u)))))
 
 
-def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
+def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
     """Return the moments of f(x, u), exactly where it is linear, else by the transform."""
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
@@ -126,7 +126,7 @@ def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of f(x, u) + w; `start` (n,) is E[x_i^2] before any data, which rounding acts on."""
-    noise = process_noise(plant, u, start)
+    noise = factor_process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
     middle, image = transform_about_mean(plant, transform, x, u)
@@ -159,18 +159,18 @@ class PredictsByTransform(Protocol):
     claim: Claim
 
 
-def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasStart) -> SmootherStep:
+def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasInitialMoments) -> SmootherStep:
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
     `start`: the plant or filter from whose initial law rounding is counted.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
-    image = image_of(plant, filter.transform, gaussian_of(step.before), u)
-    rest = sum_unexplained(image, process_noise(plant, u, second_moments_at_start(filter.plant, start)))
+    image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)
+    rest = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
     return smoother_step_of(step, (image.slopes, rest), filter.claim, plant.manifold)
 
 
-def prior_of(
+def choose_initial_moments(
     plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
 ) -> tuple[Array, Array, bool]:
     """Return initial mean (n,) and covariance (n, n), the plant's where None is given, and whether any was given."""
@@ -220,7 +220,7 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = check_plant(plant)
-    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
     claim = lower_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(

@@ -179,7 +179,7 @@ class CentredFilter(AbstractWrapper):
         return self.estimate(state)
 
 
-def center_filter(filter: AbstractBeliefFilter) -> AbstractFilter:
+def make_moving_origin_filter(filter: AbstractBeliefFilter) -> AbstractFilter:
     """Return a filter about an origin that moves with it; one of attitudes or of modes of motion as it is.
 
     Args:

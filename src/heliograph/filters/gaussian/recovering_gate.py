@@ -126,11 +126,11 @@ class GivingInFilter(AbstractSizedFilter):
         z = jnp.asarray(z)
         arrived = ~jnp.isnan(z)
         after, innovation = self.base.correct(state.believed, z, k)
-        left_out = arrived & (_component_weights(innovation) < 0.5)  # a gate's weights are 0 and 1
+        left_out = arrived & (_get_weights_of_received(innovation) < 0.5)  # a gate's weights are 0 and 1
         refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
         suspect = refused > 0
         # The rival, its prior widened where it would refuse what the gate does. It begins as the gate's state.
-        prior = _choose(jnp.any(state.refused > 0), state.rival, state.believed)
+        prior = _select_tree(jnp.any(state.refused > 0), state.rival, state.believed)
         opened = self._widen_prior(prior, z, left_out, k)
         rival, rival_innovation = self.base.correct(opened, z, k)
         evidence = state.evidence + self._compare_densities(rival_innovation, innovation, arrived & ~suspect)
@@ -139,10 +139,10 @@ class GivingInFilter(AbstractSizedFilter):
         gives_in = self._is_refused_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
         rival_continues = jnp.any(suspect) & ~gives_in
         jump = wrap_near(rival.mean, after.mean, self.angles_used().states) - after.mean
-        chosen = _choose(gives_in, rival, after)
+        chosen = _select_tree(gives_in, rival, after)
         belief = GateAndRival(
             believed=chosen,
-            rival=_choose(rival_continues, rival, chosen),
+            rival=_select_tree(rival_continues, rival, chosen),
             refused=jnp.where(gives_in, 0.0, refused),
             elapsed=jnp.where(rival_continues, state.elapsed, 0.0),
             evidence=jnp.where(rival_continues, evidence, 0.0),
@@ -150,7 +150,7 @@ class GivingInFilter(AbstractSizedFilter):
             step=jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
             moved=jnp.where(gives_in, jump, state.moved),
         )
-        return belief, _choose(gives_in, rival_innovation, innovation)
+        return belief, _select_tree(gives_in, rival_innovation, innovation)
 
     def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
         """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
@@ -171,14 +171,14 @@ class GivingInFilter(AbstractSizedFilter):
         It is widened only for numbers that the rule would refuse under this prior too.
         """
         predicted, _ = self.base.predict_received(prior, k)
-        noise, rule = at(self.base.noise, k), _gate_of(self.base)
+        noise, rule = at(self.base.noise, k), _get_gate_rule(self.base)
         # Innovation e, its variance S, and V = Var t of the state alone.
         total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
         e = wrap_near(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
         of_state = predicted.slopes**2 @ predicted.prior.variances
         needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
         # delta of each number that is to be used, (n, m); each state by itself.
-        change = _most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
+        change = _find_most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
         # P + n diag(delta^2) / min(c, 1), summed over these numbers.
         n = len(self.states)
         wider = WeightedColumns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
@@ -192,7 +192,7 @@ class GivingInFilter(AbstractSizedFilter):
             variance = jnp.diagonal(jnp.asarray(innovation.covariance))
             variance = jnp.where(counts, variance, 1.0)
             squared = jnp.where(counts, jnp.asarray(innovation.value), 0.0) ** 2 / variance
-            return -(jnp.minimum(squared, _gate_of(self.base).c) + jnp.log(variance)) / 2
+            return -(jnp.minimum(squared, _get_gate_rule(self.base).c) + jnp.log(variance)) / 2
 
         return jnp.sum(log_density(rival) - log_density(gate))
 
@@ -211,25 +211,25 @@ class GivingInFilter(AbstractSizedFilter):
         return Remark(times, f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}")
 
 
-def _most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
+def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
     """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m)."""
     prior = predicted.prior
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
     return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
 
 
-def _component_weights(innovation: Innovation) -> jax.Array:
+def _get_weights_of_received(innovation: Innovation) -> jax.Array:
     """Return the weights of the received numbers (m,)."""
     return jnp.asarray(innovation.weight)
 
 
-def _gate_of(base: RobustFilter) -> Gate:
+def _get_gate_rule(base: RobustFilter) -> Gate:
     """Return the rule of a filter whose rule is a gate."""
     assert isinstance(base.rule, Gate)
     return base.rule
 
 
-def _choose(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
+def _select_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
     """Return the tree of arrays `if_true` where the condition holds, else `if_false`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 

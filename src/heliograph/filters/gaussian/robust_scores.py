@@ -108,7 +108,7 @@ def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.A
 
 
 @readable
-class AbstractWeights(Module):
+class AbstractWeightingRule(Module):
     """Rule that weighs each component of a measurement: its noise r becomes r / w in one joint update."""
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
@@ -124,18 +124,18 @@ class AbstractWeights(Module):
         return w, w
 
 
-def update_weighted(
-    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeights
+def update_with_weights(
+    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeightingRule
 ) -> ScoreUpdate:
     """Return one joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; without components of weight zero."""
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
     w, shown = rule.iterate(before, noise, e, arrived)
-    after = joint_update(before, e, arrived & (w > SMALLEST), reweight(noise, w))
+    after = joint_update(before, e, arrived & (w > SMALLEST), divide_noise_by_weights(noise, w))
     return ScoreUpdate(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
 
 
-def reweight(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
+def divide_noise_by_weights(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
     """Return r_ij / sqrt(w_i w_j): each row over the root of its weight."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
@@ -154,7 +154,7 @@ def expected_squared_residuals(
     return (e - after.mean) ** 2 + after.columns.diagonal
 
 
-def branch_precision(
+def expected_branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
     """Return the expected precision sum q_j r / r_j of each component's noise, and the noise's mean by it; (m,) each.

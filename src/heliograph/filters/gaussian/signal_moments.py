@@ -67,7 +67,7 @@ class Signal(NamedTuple):
         return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
 
 
-def signal_of(
+def find_signal_moments(
     plant: AbstractPlant,
     sensor: AbstractSensor,
     transform: AbstractTransform,
@@ -93,11 +93,11 @@ def signal_of(
         image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
     mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
     second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
-    size = signal_size_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
+    size = bound_signal_power_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
     return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=noise, second=second, size=size)
 
 
-def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
+def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     """Return (|H| root E[x_i^2] + |E v|)^2 + Var v at the start, (p,): size of the terms that are summed in y.
 
     `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
@@ -123,10 +123,10 @@ def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
     plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
-    return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
+    return join_columns(plain, factor_gain_noise(gain_spread, signal.second, signal.mean))
 
 
-def gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
+def factor_gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
     return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
 
@@ -136,9 +136,9 @@ def factor_spread(spread: jax.Array) -> WeightedColumns:
     return eliminate(spread, LOST * unit_of(spread))
 
 
-def link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
+def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
-    return join_columns(channel.noise, gain_noise(channel.gain_spread, second, mean))
+    return join_columns(channel.noise, factor_gain_noise(channel.gain_spread, second, mean))
 
 
 def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:

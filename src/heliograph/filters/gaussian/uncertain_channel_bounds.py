@@ -54,7 +54,7 @@ def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
     return instance("scalars", scalars, Scalars, "Scalars").values
 
 
-def as_scalars(values: np.ndarray) -> Scalars | None:
+def scalars_from_array(values: np.ndarray) -> Scalars | None:
     """Return the scalars from two numbers, None for NaN: the inverse of `scalars_as_array`."""
     return None if np.isnan(values).any() else Scalars(*values)
 
@@ -65,7 +65,7 @@ def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
     return chosen
 
 
-def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
+def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalars: Array) -> Gaussian:
     """Return the state after z by `Polytope`'s bound; scalars b1, b2 (2,), NaN to minimise the trace over them.
 
     (1 + b1) P - C' Omega^-1 C with Omega = base + (1/b1 + 1/b2) shift + (1 + b2) M (H P H' + R) M' is what a Kalman
@@ -73,7 +73,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
     (1 + b2) M R M'] + (1 + b1) ((1 + b1)(1 + b2) - 1) M H P H' M', positive terms; its gain is K / (1 + b1).
     """
     prior, present = signal.prior, z.present
-    slopes, of_state, of_noise = _select_received(signal, channel, present)
+    slopes, of_state, of_noise = _find_received_slopes_and_covariances(signal, channel, present)
     w = augmented_second_moment(signal.second, signal.mean, 1.0)
     base, shift = channel.spread(w, present), channel.shift(w, present)
     # The scalars of least trace; C = Cov(x, z).
@@ -88,7 +88,7 @@ def observe_by_young(signal: Signal, channel: SecondOrder, z: ArrivedInnovation,
     return condition_on_observation(wide, slopes, a * z.innovation, factor_spread(noise), present)[0]
 
 
-def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
+def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: ArrivedInnovation, scalar: Array) -> Gaussian:
     """Return the state after z by `ZeroMean`: the prior error has mean zero, its correlation with the gain is unknown.
 
     z = G y + n; y has mean yhat, covariance Pyy and slopes H in the state, whose covariance is P; M = E G. For each
@@ -103,7 +103,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
         scalar: log beta (1,), NaN for the one of least trace.
     """
     prior, present = signal.prior, z.present
-    slopes, of_state, _ = _select_received(signal, channel, present)
+    slopes, of_state, _ = _find_received_slopes_and_covariances(signal, channel, present)
     # E[y y'] = yhat yhat' + Cov y: the gain's correlation is unknown with the error alone.
     # Each part as a second moment of (y, 1).
     mean_part = augmented_second_moment(signal.second - signal.covariance, signal.mean, 1.0)
@@ -126,7 +126,7 @@ def observe_by_zero_mean(signal: Signal, channel: SecondOrder, z: ArrivedInnovat
     return keep_where_unchanged(jnp.any(present), wider, after)
 
 
-def _select_received(
+def _find_received_slopes_and_covariances(
     signal: Signal, channel: SecondOrder, present: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return M H (m, n), and M H P H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.

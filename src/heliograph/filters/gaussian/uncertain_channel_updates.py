@@ -15,11 +15,11 @@ from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, condition_on_received
 from heliograph.filters.gaussian.uncertain_channel_bounds import (
     Scalars,
-    as_scalars,
+    condition_by_young_bound,
+    condition_by_zero_mean_bound,
     keep_where_unchanged,
-    observe_by_young,
-    observe_by_zero_mean,
     scalars_as_array,
+    scalars_from_array,
 )
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail
@@ -125,7 +125,7 @@ class Polytope(AbstractUpdate):
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
-        return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
+        return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """Return "upper" where the law is uncertain, else "exact"."""
@@ -159,7 +159,7 @@ class ZeroMean(AbstractUpdate):
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Return `nominal` behind a known law; else minimise the trace over K, and over beta unless it is fixed."""
-        return observe_by_zero_mean(signal, channel, z, self.scalar) if channel.uncertain else nominal
+        return condition_by_zero_mean_bound(signal, channel, z, self.scalar) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """Return "nominal" where the law is uncertain, since E[e | data] is not 0 after a correction; else "exact"."""
@@ -195,11 +195,11 @@ class Interval(AbstractUpdate):
 
     def described(self) -> AbstractUpdate:
         """Return Young's bound, as for a polytope."""
-        return Polytope(as_scalars(self.scalars))
+        return Polytope(scalars_from_array(self.scalars))
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
-        return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
+        return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
     def claim(self, uncertain: bool) -> Claim:
         """Return "upper" where the law is uncertain."""

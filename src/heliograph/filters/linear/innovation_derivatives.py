@@ -67,7 +67,7 @@ def differentiate_start(make: Callable[[Array], Any], x: Array) -> EstimateWithD
         make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
         x: the free numbers (p,).
     """
-    starts = [jax.jvp(lambda x: _start_of(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x))]
+    starts = [jax.jvp(lambda x: _find_initial_moments(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x))]
     return EstimateWithDerivatives(jax.tree.map(jnp.asarray, make(x).init().gaussian), tuple(starts))
 
 
@@ -119,7 +119,7 @@ def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
     )
 
 
-def _start_of(filter: Any) -> MomentSlopes:
+def _find_initial_moments(filter: Any) -> MomentSlopes:
     """Return the mean and covariance before the first step."""
     plant = at(filter.plant, 0)
     return MomentSlopes(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))

@@ -16,7 +16,7 @@ import heliograph.filters.wrappers as wrappers
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel_moments
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
-from heliograph.filters.gaussian.signal_moments import Signal, signal_size_at_start
+from heliograph.filters.gaussian.signal_moments import Signal, bound_signal_power_at_start
 from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
 from heliograph.filters.linear.likelihood_scores import ScoreRecursion
@@ -156,7 +156,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
         slopes=slopes,
         noise=noise.columns,
         second=symmetric(second),
-        size=signal_size_at_start(sensor, start),
+        size=bound_signal_power_at_start(sensor, start),
     )
 
 

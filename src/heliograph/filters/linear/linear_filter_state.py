@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
-from heliograph.filters.gaussian.gaussian_prediction import process_noise
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.linalg import symmetric
 from heliograph.numerics.traced import library
@@ -34,7 +34,7 @@ def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> Plant
         matrix=plant.transition_matrix(u),
         shift=plant.shift(u),
         covariance=plant.noise_covariance(u),
-        noise=process_noise(plant, u, start),
+        noise=factor_process_noise(plant, u, start),
     )
 
 
@@ -62,10 +62,10 @@ def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     gaussian = predict_affine(belief.gaussian, step.matrix, step.shift, step.noise)
     mean = step.matrix @ belief.state_mean + step.shift
     covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
-    return LinearBelief(gaussian, *_within_range(mean, symmetric(covariance)))
+    return LinearBelief(gaussian, *_limit_to_finite_squares(mean, symmetric(covariance)))
 
 
-def _within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
     Behind a known gain nothing depends on them.

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.linear.scheduled_gains import LinearSystemFilter, ScheduledFilter, ScheduleState
-from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant, mean_before_data
+from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant, find_unconditional_mean
 from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lift import lifted_system
@@ -199,7 +199,7 @@ def _lift_about_mean(
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
-    centre = mean_before_data(plant, sensor, channel)
+    centre = find_unconditional_mean(plant, sensor, channel)
     centred_plant = plant if centre is None else centre_plant(plant)
     return centre, lifted_system(centred_plant, sensor, channel, degree, horizon)
 

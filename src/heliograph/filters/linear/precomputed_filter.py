@@ -159,7 +159,7 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     def record_step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
         """Step the filter; the output is the step's matrices, and the covariances before and after correction."""
         k, u = row
-        step, prior, after = plan_step(filter, state, zeros, u, k)
+        step, prior, after = record_step_matrices(filter, state, zeros, u, k)
         covariances = jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)])
         return after, (step, covariances)
 
@@ -181,7 +181,7 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
 _plan_by_xla = quickly_compiled(_record_matrices)
 
 
-def plan_step(
+def record_step_matrices(
     filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
 ) -> tuple[LinearStep, PyTree, PyTree]:
     """Return the matrices of step k, the state after its prediction, and that after its correction.
@@ -242,7 +242,7 @@ def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Arra
     if isinstance(filter, PlannedFilter):
         outcome: LinearStep = at(filter.steps, k)
         return outcome
-    step, _, _ = plan_step(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    step, _, _ = record_step_matrices(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
     return step._replace(
         gain=jnp.where(present, step.gain, 0.0),

@@ -30,7 +30,7 @@ class UnconditionalMean(Module):
 
 
 @in_float64
-def mean_before_data(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UnconditionalMean | None:
+def find_unconditional_mean(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UnconditionalMean | None:
     """Return E[x_0], A_k, b_k and G_k C_k of a linear model, from which E x_k and E z_k follow before any data.
 
     None where E x is zero throughout, or a gain is random.

@@ -3,7 +3,7 @@
 from .additive_links import AdditiveModalFilter as AdditiveModalFilter
 from .additive_links import additive_modal_filter as additive_modal_filter
 from .additive_links import independent_terms as independent_terms
-from .arrival_patterns import SideInformation as SideInformation
+from .arrival_patterns import ChannelByPattern as ChannelByPattern
 from .arrival_patterns import append_flag as append_flag
 from .arrival_patterns import describe_by_pattern as describe_by_pattern
 from .arrival_patterns import pattern_of as pattern_of

@@ -30,9 +30,9 @@ from heliograph.filters.modes.jump_linear_filter import (
     channels_by_mode,
     claim_of_modes,
     concatenate_modes,
+    condition_modes_on_received,
     covariance_of_mode,
     kron,
-    observe_modes,
     predict_by_mode,
 )
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, pad_with_zeros
@@ -120,7 +120,7 @@ class AdditiveModalFilter(AbstractModalFilter):
         gains given the modes, D_0 = Hbar.
         """
         output, x = self._measurement_model(state, k), state.gaussian
-        after, innovation = observe_modes(x, x.mean - self._mean_from_centre(state.centre), output, z)
+        after, innovation = condition_modes_on_received(x, x.mean - self._mean_from_centre(state.centre), output, z)
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

@@ -25,7 +25,7 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.gaussian_prediction import process_noise, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.state_limits import accept_limits
@@ -126,7 +126,7 @@ class MixtureFilter(AbstractSizedFilter):
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
         """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        noise = process_noise(plant, u, second_moments_at_start(self.plant))
+        noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
         return MixtureBelief(gaussian=moved, law=law, moved=jnp.asarray(True))
@@ -176,7 +176,7 @@ class MixtureFilter(AbstractSizedFilter):
         """Return the smoother step of x+ = A x + b + w, of the one Gaussian before and after."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         slopes = plant.transition_matrix(u) @ step.before.gaussian.root
-        noise = process_noise(plant, u, second_moments_at_start(self.plant))
+        noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         return smoother_step_of(step, (slopes, noise), "nominal", plant.manifold)
 
 

@@ -145,7 +145,7 @@ class AbstractJointModalFilter(AbstractModalFilter):
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """Return x = sum_j zeta^j."""
-        return sum_of_modes(len(self.states), len(self.initial))
+        return make_mode_sum_matrix(len(self.states), len(self.initial))
 
 
 class ModalFilter(AbstractJointModalFilter):
@@ -196,7 +196,7 @@ class ModalFilter(AbstractJointModalFilter):
         spread of the gains in mode j.
         """
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        after, innovation = observe_modes(state.gaussian, centred, self._measurement_model(state, k), z)
+        after, innovation = condition_modes_on_received(state.gaussian, centred, self._measurement_model(state, k), z)
         return state._replace(gaussian=after), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
@@ -233,7 +233,7 @@ class ModalFilter(AbstractJointModalFilter):
         sent = propagate_by_mode(measure, state.moments, law[:, None, None] * noise)
         gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
         # Noise of sensor and links, in the mean over the modes, and rounding.
-        plain = known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
+        plain = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
         rounding = rounding_of_received(gains, sent)
         return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
 
@@ -270,7 +270,7 @@ def separate_modes(among: jax.Array) -> WeightedColumns:
     return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
 
 
-def known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
+def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
     """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
@@ -289,12 +289,12 @@ def kron(a: jax.Array, b: jax.Array) -> jax.Array:
     return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
 
 
-def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
+def make_mode_sum_matrix(n: int, modes: int) -> Float[np.ndarray, "n N"]:
     """Return the matrix (n, N) that maps zeta to x = sum_j zeta^j."""
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
-def observe_modes(
+def condition_modes_on_received(
     x: Gaussian, centred: jax.Array, output: MeasurementModel, z: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
     """Return zeta, the state times the indicator of each mode, given the components of z that arrived; the innovation.

@@ -21,11 +21,11 @@ from heliograph.filters.base import (
 )
 from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, second_moments_at_start
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
-from heliograph.filters.gaussian.signal_moments import signal_of
-from heliograph.filters.modes.arrival_patterns import SideInformation
+from heliograph.filters.gaussian.signal_moments import find_signal_moments
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.mixing import align_angles
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.multiple_model import (
-    align_angles,
     correct_in_every_mode,
     replicate,
 )
@@ -82,7 +82,7 @@ class ParticleFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     initial: Float[Array, " M"]
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
@@ -127,7 +127,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.gaussian)
+        signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, start))(state.gaussian)
         after, weight, mixed = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )

@@ -21,9 +21,9 @@ from heliograph.filters.modes.jump_linear_filter import (
     claim_of_modes,
     compute_initial_moments,
     concatenate_modes,
+    condition_modes_on_received,
     fields_of_joint_modes,
     mean_from_centre,
-    observe_modes,
     predict_by_mode,
     rounding_of_received,
     separate_modes,
@@ -127,7 +127,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         output = MeasurementModel(concatenate_modes(matrix), common, join_columns(rounding, factor_spread(added)))
-        after, innovation = observe_modes(state.gaussian, centred, output, z)
+        after, innovation = condition_modes_on_received(state.gaussian, centred, output, z)
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

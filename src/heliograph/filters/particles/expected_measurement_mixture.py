@@ -32,7 +32,7 @@ class ReceivedSums(NamedTuple):
     chance: jax.Array
 
 
-def find_base(reference: ExpectedMixture, z: jax.Array, angles: Angles) -> jax.Array:
+def find_reference_innovation(reference: ExpectedMixture, z: jax.Array, angles: Angles) -> jax.Array:
     """Return the innovation (m,) of the largest part of what a particle expects, 0 for one that is no number."""
     expected = jnp.asarray(reference.expected)[jnp.argmax(jnp.asarray(reference.share))]
     return wrap_near(z - jnp.where(jnp.isfinite(expected), expected, 0.0), jnp.zeros(len(z)), angles)

@@ -60,7 +60,7 @@ def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
     return repeated
 
 
-def sum_clouds(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
+def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
     """Return the first sums of particles (B,) and modes, and of the weights of modes.
 
     The mean direction is that of E exp(i angle), and an angle's Gaussian has exp(i m - variance / 2).
@@ -74,7 +74,7 @@ def sum_clouds(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums
     return StateSums(sums, jnp.sum(share.reshape(-1, modes), axis=0) if modes > 1 else None)
 
 
-def sum_clouds_apart(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
+def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
     """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
     share, mean = _list_parts(weight, particles)
     apart = wrap_angles(mean - sums.first.mean(angles), angles)

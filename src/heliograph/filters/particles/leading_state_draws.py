@@ -35,7 +35,7 @@ def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
     return x._replace(mean=x.mean + x.root[:, :drawn] @ xi, variances=x.variances.at[:drawn].set(0.0))
 
 
-def find_certain(x: Gaussian, d: jax.Array) -> jax.Array:
+def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
     """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,)."""
     drawn = len(d)
     second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2

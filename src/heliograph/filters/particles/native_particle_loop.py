@@ -15,7 +15,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.chunks import ScanResult
-from heliograph.filters.particles.expected_measurement import find_reference
+from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.resampling import resample_concrete_weights
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, PyTree
@@ -25,10 +25,7 @@ GROUP = 16  # particles that a lane adds up
 
 
 class DataRow(NamedTuple):
-    """A row of data: its number, measurement and input; keys of its noises and proposals; whether it is not the first.
-
-    Of rows, with a leading axis.
-    """
+    """A row of data, or rows along a leading axis: number k, z, u and random keys; `moved`: it is not the first."""
 
     k: Array
     z: Array
@@ -81,7 +78,7 @@ def filter_particles(
         return _filter_rows(filter, np.asarray(z), np.asarray(u), state, int(begin))
 
 
-class _RowMemory(NamedTuple):
+class _RowArrays(NamedTuple):
     """Arrays that the programs of a row read in place: the row, particles, and sums over them.
 
     `particles` are those before the row, a tree, and `log_weight` their log weights, the largest 0; `prior` are the
@@ -106,7 +103,7 @@ class _ParticlePrograms(NamedTuple):
     `now` are the particles behind the last row, and `log_weight` their log weights; `predicted` what each expected.
     """
 
-    memory: _RowMemory
+    memory: _RowArrays
     now: PyTree
     log_weight: np.ndarray
     predicted: tuple[np.ndarray, ...]
@@ -134,12 +131,12 @@ def _compile_programs(
         k=np.zeros((), int), z=np.zeros_like(z[0]), u=np.zeros_like(u[0]), noise_key=noise_key,
         proposal_key=proposal_key, moved=np.ones((), bool),
     )  # fmt: skip
-    used, particles = np.ones((), bool), filter.make_room(length)
+    used, particles = np.ones((), bool), filter.allocate_particles(length)
     log_weight, prior, weight = np.zeros((3, length))
     # First program: a particle moved and weighed in each lane. It returns the particle's arrays, its log weight, and
     # what it expected of z. Booleans say which arguments differ from lane to lane.
     before = row, used, particles, log_weight, numbers
-    advance = _bind_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
+    advance = _compile_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
     if advance is None:
         return None
     leaves, structure = jax.tree.flatten(particles)
@@ -151,30 +148,30 @@ def _compile_programs(
         lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]),
         ParticleGroup(prior, weight, now, predicted),
     )
-    first = _bind_in_place(_sum_first, filter, (row, reference, group), (False, False, True), len(group.weight))
+    first = _compile_in_place(_sum_for_mean, filter, (row, reference, group), (False, False, True), len(group.weight))
     if first is None:
         return None
     states = np.zeros(first.outputs[0].shape[1])
     arguments = states, group.weight, group.particles
-    second = _bind_in_place(_sum_second, filter, arguments, (False, True, True), len(group.weight))
+    second = _compile_in_place(_sum_for_covariance, filter, arguments, (False, True, True), len(group.weight))
     if second is None:
         return None
-    memory = _RowMemory(*before, prior=prior, weight=weight, reference=reference, states=states)
+    memory = _RowArrays(*before, prior=prior, weight=weight, reference=reference, states=states)
     return _ParticlePrograms(memory, now, log_weight_now, predicted, advance=advance, first=first, second=second)
 
 
-def _bind_in_place(
+def _compile_in_place(
     function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int
 ) -> Any:
     """Return a call of function(filter, *arguments), `runs` times, that reads these arrays in place.
 
     `differs` says which arguments have an entry for each run. None without native code.
     """
-    code = _bind(function, filter, arguments, differs)
+    code = _compile_call(function, filter, arguments, differs)
     return None if code is None else code.for_runs(runs, dict(enumerate(jax.tree.leaves(arguments))))
 
 
-def _bind(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
+def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
     """Return the code of function(filter, *arguments), to be called with the arguments; None if there is none."""
     choice = choose_code(function, (filter, *arguments), [False, *differs])
     if choice.code is None:
@@ -205,30 +202,31 @@ def _advance_particle(
     return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
-def _sum_first(
+def _sum_for_mean(
     filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
 ) -> tuple[jax.Array, jax.Array]:
     """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
-    return _pack_sums(filter.sum_states(group.weight, group.particles)), _pack_sums(received)
+    return _pack_sums(filter.sum_for_mean(group.weight, group.particles)), _pack_sums(received)
 
 
-def _sum_second(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
+def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
     """Return the second sums of the states of a group of particles, about the means of all."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
-    second: jax.Array = filter.sum_apart(weight, particles, _unpack_sums(states, filter.sum_states, weight, particles))
+    sums = _unpack_sums(states, filter.sum_for_mean, weight, particles)
+    second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
     return second
 
 
 def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
     """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles."""
-    one, weight = jax.tree.map(jnp.asarray, filter.make_room(1)), jnp.ones(1)
-    states = _unpack_sums(sums.states, filter.sum_states, weight, one)
+    one, weight = jax.tree.map(jnp.asarray, filter.allocate_particles(1)), jnp.ones(1)
+    states = _unpack_sums(sums.states, filter.sum_for_mean, weight, one)
     predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
     received = _unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
-    estimate = filter.estimate_of(states, sums.second)
-    innovation = filter.innovation_of(received, sums.reference, row.z, row.k, sums.density)
+    estimate = filter.estimate_from_sums(states, sums.second)
+    innovation = filter.innovation_from_sums(received, sums.reference, row.z, row.k, sums.density)
     count = states.first.weight**2 / states.first.square
     return estimate.mean, estimate.covariance, innovation, estimate.modes, count
 
@@ -267,7 +265,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]
-        draw = _bind(_draw_start, filter, (start_key, numbers), (False, True))
+        draw = _compile_call(_draw_start, filter, (start_key, numbers), (False, True))
         if draw is None:
             return None
         loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
@@ -388,9 +386,10 @@ class _ParticleLoop:
 
     def _find_reference(self) -> None:
         """Keep what the heaviest particle before z was known expects, of those where it is a number."""
-        best: Any = np.argmax(self.memory.prior)
+        prior: Any = self.memory.prior
+        best: Any = np.argmax(prior)
         if not all(np.isfinite(part[best]).all() for part in self.predicted):
-            best = find_reference(self.memory.prior[: self.count], tuple(part[: self.count] for part in self.predicted))
+            best = find_reference_particle(prior[: self.count], tuple(part[: self.count] for part in self.predicted))
         for held, new in zip(self.memory.reference, self.predicted, strict=True):
             held[...] = new[best]
 

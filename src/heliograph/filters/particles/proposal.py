@@ -101,6 +101,6 @@ def propose_particles(
     return ProposedParticles(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
 
 
-def noise_columns(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
+def factor_noise_covariance(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
     """Return the factors of Cov w (n, n) of a plant under the input u."""
     return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

@@ -20,32 +20,32 @@ from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,
     WeighedParticles,
-    keep_unused,
     relative_to_largest,
+    update_if_used,
 )
 from heliograph.filters.particles.expected_measurement_mixture import (
     ExpectedMixture,
     ReceivedSums,
     compute_mixture_innovation,
-    find_base,
+    find_reference_innovation,
     sum_mixtures,
 )
 from heliograph.filters.particles.gaussian_particles import (
     Cloud,
     PartlyDrawn,
     repeat_for_modes,
-    sum_clouds,
-    sum_clouds_apart,
+    sum_clouds_for_covariance,
+    sum_clouds_for_mean,
 )
 from heliograph.filters.particles.leading_state_draws import (
     condition_on_draw,
     condition_on_leading_states,
     draw_index,
-    find_certain,
+    find_states_without_variance,
     slopes_given_drawn,
 )
 from heliograph.filters.particles.moments import StateSums
-from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
+from heliograph.filters.particles.proposal import PRIOR_SHARE, factor_noise_covariance
 from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
@@ -93,7 +93,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         particles = self.draw_start(own, jnp.arange(self.particles))
         return self.state_of(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
-    def make_room(self, count: int) -> Any:
+    def allocate_particles(self, count: int) -> Any:
         """Return arrays of so many particles, to be filled."""
         modes, n = len(self.initial), len(self.order)
         each: Any = (np.zeros((count, modes, *size)) for size in ((n,), (n * (n - 1) // 2,), (n,), ()))
@@ -168,7 +168,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
         order = np.array(self.order)
         # Of a linear plant the drawn states may have a variance still; of others they are known.
-        noise, known = noise_columns(plant, u), 0 if self._is_linear([plant]) else self.drawn
+        noise, known = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
 
         def move(x: jax.Array) -> jax.Array:
             """Return f(x), drawn states first in x and in the result."""
@@ -195,7 +195,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
         used = (self.always_used | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
-        after = keep_unused(used, updated, state._replace(key=key))
+        after = update_if_used(used, updated, state._replace(key=key))
         return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -283,7 +283,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         d = condition_on_draw(source, draw).mean[: self.drawn]
         # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d). States
         # that are known already have no density: they are `certain`, and left out of both.
-        certain = find_certain(prior, d)
+        certain = find_states_without_variance(prior, d)
         rest, log_prior = condition_on_leading_states(prior, d, certain)
         log_linearised = log_posterior_mode[mode] + condition_on_leading_states(linearised, d, certain)[1]
         log_p = log_mode[mode] + log_prior
@@ -367,26 +367,27 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> ReceivedSums:
         """Return sums of how far innovations of particles (B,), modes and atoms are from that of a reference."""
-        base = find_base(ExpectedMixture(*reference), z, self.observed_angles)
+        base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
-    def innovation_of(
+    def innovation_from_sums(
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
         """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
         return compute_mixture_innovation(
-            received, find_base(ExpectedMixture(*reference), z, self.observed_angles), z, density
+            received, find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles), z, density
         )
 
-    def sum_states(self, weight: jax.Array, particles: Cloud) -> StateSums:
+    def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""
-        return sum_clouds(weight, particles, self._angles_in_order(models_of(first(self.plant))[0]))
+        return sum_clouds_for_mean(weight, particles, self._angles_in_order(models_of(first(self.plant))[0]))
 
-    def sum_apart(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
+    def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
-        return sum_clouds_apart(weight, particles, sums, self._angles_in_order(models_of(first(self.plant))[0]))
+        angles = self._angles_in_order(models_of(first(self.plant))[0])
+        return sum_clouds_for_covariance(weight, particles, sums, angles)
 
-    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+    def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
         back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
         mean = sums.first.mean(self._angles_in_order(models_of(first(self.plant))[0]))

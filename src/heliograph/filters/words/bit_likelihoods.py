@@ -54,7 +54,7 @@ class LinkOfBits(Module):
         return [infer_sent_bits(link, received) for link in self.links]
 
 
-def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
+def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     """Return a channel of words as its possible laws, each with known error rates, and their probabilities.
 
     Raises:

@@ -117,7 +117,7 @@ def build_behind_words(
     # The sensor of y - c with rounding, and the filter of numbers behind it.
     # Whether the rounding of a Gaussian y is described exactly; filters of modes, and of past signals, use bounds.
     gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers
-    rounded = at_each_step(lambda of_step: _round_sensor(of_step, encoder, gaussian, fades), sensor)
+    rounded = at_each_step(lambda of_step: _add_rounding_noise(of_step, encoder, gaussian, fades), sensor)
     base = make(plant, rounded, numbers)
     overload = bound_overload(plant, rounded, numbers, encoder, places)
     refuse_overload(overload)
@@ -126,7 +126,7 @@ def build_behind_words(
     gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"
-    claim = weakest([lower_by_noise(base.claim, rounded), claim_of_delay, _claim_of(overload)])
+    claim = weakest([lower_by_noise(base.claim, rounded), claim_of_delay, _claim_despite_overload(overload)])
     return LinearWordsFilter(
         base=base,
         centres=centres,
@@ -149,12 +149,12 @@ def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) 
         )
 
 
-def _claim_of(overload: Overload) -> Claim:
+def _claim_despite_overload(overload: Overload) -> Claim:
     """Return "exact" where overload changes the rms error by 1 % at most, else "nominal"."""
     return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
 
 
-def _round_sensor(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
+def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
     """Return the sensor of y - c whose noise has the error of rounding."""
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))

@@ -59,7 +59,7 @@ def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: Sig
         return (grid.low + (cell * words_of_cell + mean) * grid.step - prior.mean) / prior.deviation
 
     # Likelihoods of the bits of the cells' numbers, and the cell of the received word.
-    upper, received_cell = _shift_bits(pairs, low_bits), jnp.floor(received / words_of_cell)
+    upper, received_cell = _drop_low_bits(pairs, low_bits), jnp.floor(received / words_of_cell)
     sums = _sum_blocks(upper, start / block, distance_of(start), width, wide)
     # The received word may be far more likely than all others: where no block has its cell, that is added.
     is_outside = (received_cell < start) | (received_cell >= start + BLOCKS * block)
@@ -124,7 +124,7 @@ def _sum_blocks(
     return sums
 
 
-def _shift_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
+def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
     """Return the likelihoods of the bits from number `count` on (bits, 2), filled with bits that are surely zero.
 
     By shifts of 1, 2, 4, ... as the binary digits of `count` say, which is known at run time only.

@@ -174,6 +174,6 @@ def _merge(state: Hypotheses) -> Gaussian:
     return merge_mixture(*state)
 
 
-def keep_two_hypotheses(base: WordFilter) -> TwoHypothesesFilter:
+def make_two_hypotheses_filter(base: WordFilter) -> TwoHypothesesFilter:
     """Return the filter of two hypotheses that uses the moments of one."""
     return TwoHypothesesFilter(base=base, **make_sizes(base.claim, first(base.plant), base.received))

@@ -16,7 +16,7 @@ from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.signal_moments import Signal, innovation_covariance, signal_of
+from heliograph.filters.gaussian.signal_moments import Signal, find_signal_moments, innovation_covariance
 from heliograph.filters.words.bit_likelihoods import LinkOfBits
 from heliograph.filters.words.word_moments import WordEffect, find_effect_of_bits, find_effect_of_cell
 from heliograph.filters.words.word_sums import SignalPrior, WordGrid
@@ -91,7 +91,7 @@ class WordFilter(AbstractBeliefFilter):
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of y before it is rounded."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
-        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
+        return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     def identify_received_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
         """Return which word of each component was received, and what its bits say of those that were sent.
@@ -118,7 +118,7 @@ class WordFilter(AbstractBeliefFilter):
         first_copies = []
         for i in range(len(self.low)):
             copies = np.flatnonzero(component == i)
-            first_copies.append(_pick_first([(arrived[j], number[j], dither[j]) for j in copies]))
+            first_copies.append(_pick_first_copy([(arrived[j], number[j], dither[j]) for j in copies]))
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
         # P(received | sent 0) and P(received | sent 1) of each bit, under each possible set of error rates of the link,
         # and the probabilities of these sets.
@@ -232,7 +232,7 @@ class ReceivedWords(NamedTuple):
     are_words: jax.Array
 
 
-def _pick_first(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
+def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
     """Return presence, number and dither of the first copy that came; zeros of none."""
     chosen = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
     for came, number, d in reversed(copies):

@@ -103,7 +103,7 @@ def sum_neighbours(
     return sums
 
 
-def sum_window(
+def sum_words_near_prior(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
@@ -218,7 +218,7 @@ def find_effect_of_bits(
 
     def sum_wide_words() -> WordEffect:
         """Sum word by word within the prior's reach."""
-        return find_effect_from_sums(sum_window(pairs, weights, received, grid, prior, dither))
+        return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
     def sum_fine_words() -> WordEffect:
         """Sum over cells of several words each, and over the overloads beyond the ends."""

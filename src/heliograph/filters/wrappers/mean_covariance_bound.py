@@ -73,7 +73,7 @@ def mean_error_bound(
         raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)
     given = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
     u = check_rows("inputs", given, steps, len(filter.inputs), missing=False)
-    return np.asarray(_bound_mean_covariance(filter, _list_contexts(filter), np.asarray(u)))
+    return np.asarray(_bound_mean_covariance(filter, _list_told_numbers(filter), np.asarray(u)))
 
 
 @compile_in_float64
@@ -126,7 +126,7 @@ def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array)
     return covariances_over_time
 
 
-def _list_contexts(filter: ToldFilter) -> ToldContexts:
+def _list_told_numbers(filter: ToldFilter) -> ToldContexts:
     """Return the numbers that a message may tell, with their probabilities, by mode of the chain that tells them.
 
     A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all

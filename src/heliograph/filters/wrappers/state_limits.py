@@ -73,7 +73,7 @@ class LimitedFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct the prediction, its mean held within the limits."""
-        prior = state if _is_particles(state) else self._hold_means(state)
+        prior = state if _holds_particles(state) else self._hold_means(state)
         after, innovation = self.base.correct(prior, z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_after, log_before = self._condition_with_mass(after)[0], self._condition_with_mass(state)[0]
@@ -123,7 +123,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     def _state_before_prediction(self, state: PyTree) -> PyTree:
         """Return the state from which the next prediction starts."""
-        return self.condition(state) if _is_particles(state) else self._hold_means(state)
+        return self.condition(state) if _holds_particles(state) else self._hold_means(state)
 
     def _hold_means(self, state: PyTree) -> PyTree:
         """Return a filter's state with the means of its Gaussians held within the limits."""
@@ -131,13 +131,13 @@ class LimitedFilter(AbstractSizedFilter):
             return state._replace(base=self._hold_means(state.base))
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
             return state._replace(believed=self._hold_means(state.believed), rival=self._hold_means(state.rival))
-        if _is_particles(state):
+        if _holds_particles(state):
             return state
         x = Gaussian(*map(jnp.asarray, gaussian_of(state)))
-        hold = jax.vmap(self._hold_one) if x.mean.ndim == 2 else self._hold_one
+        hold = jax.vmap(self._hold_mean) if x.mean.ndim == 2 else self._hold_mean
         return with_gaussian(state, hold(x))
 
-    def _hold_one(self, x: Gaussian) -> Gaussian:
+    def _hold_mean(self, x: Gaussian) -> Gaussian:
         """Return one Gaussian with its mean held within the limits."""
         return hold_mean_within_limits(x, self.limits)
 
@@ -193,7 +193,7 @@ class LimitedFilter(AbstractSizedFilter):
         )
 
 
-def _is_particles(state: PyTree) -> bool:
+def _holds_particles(state: PyTree) -> bool:
     """Return whether a filter's state, or that of the filter within one of sensor inputs, is of particles."""
     return isinstance(getattr(state, "base", state), particles.StateParticles)
 

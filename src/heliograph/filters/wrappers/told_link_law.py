@@ -89,7 +89,7 @@ class ToldFilter(AbstractWrapper):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the filter of the law that the numbers of the message give."""
         values, numbers = self._split(jnp.asarray(z))
-        filter, is_law = self._filter_given(numbers, k)
+        filter, is_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
         # Numbers that give no law make the state NaN, so that the message is refused where it came in.
         after = _spoil_state(after, ~is_law & ~jnp.all(jnp.isnan(values)))
@@ -112,7 +112,7 @@ class ToldFilter(AbstractWrapper):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the law that was told."""
         values, numbers = self._split(jnp.asarray(step.z))
-        filter, _ = self._filter_given(numbers, step.k)
+        filter, _ = self._make_filter_given(numbers, step.k)
         return filter.smoother_step(step._replace(z=values))
 
     @property
@@ -162,7 +162,7 @@ class ToldFilter(AbstractWrapper):
         """True for the numbers that may be missing, of all that are told (numbers,)."""
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in told_maps(first(self.link))])
 
-    def _filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
+    def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
         """Build the filter of the law that the numbers give, and tell whether they give one.
 
         Where a number is missing that must not, it is that of a typical law.
