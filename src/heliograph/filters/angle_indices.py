@@ -1,4 +1,4 @@
-"""The angles that a filter uses."""
+"""Which of a filter's states, and of the numbers that it receives, are angles."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from heliograph.numerics.angle import Angles
 
 
 class FilterAngles(NamedTuple):
-    """Places of the angles among a filter's states, and among the numbers that it receives."""
+    """Indices of the angles among a filter's states, and among the numbers that it receives."""
 
     states: Angles
     received: Angles

@@ -1,4 +1,4 @@
-"""Calls of a filter's methods by a user: what is no state is said, and inputs of which a plant makes what is none."""
+"""Calls of a filter by a user: refuse a state that is none of the filter, and inputs that its plant cannot take."""
 
 from collections.abc import Callable
 from functools import cache

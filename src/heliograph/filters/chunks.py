@@ -145,12 +145,12 @@ def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> Chun
             return None
         first = np.arange(0, total, lengths.chunk)
         complete = find_complete_blocks(rows[0], lengths.ahead)
-        whole = complete.cover(first, lengths.chunk)
+        whole = complete.are_complete(first, lengths.chunk)
         settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
         for law in [None] if settled is None else [settled, None]:
             states = _find_start_states(WarmUpRun(recursion, rows, complete, law), start, first[1:])
             if states is not None:
-                covered = whole & (False if law is None else law.covers(states))
+                covered = whole & (False if law is None else law.matches(states))
                 return ChunkStarts(
                     states=states, first=first, lengths=lengths, settled=law, covered=covered, complete=complete
                 )
@@ -178,7 +178,7 @@ def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, 
 
 
 class WarmUpRun(NamedTuple):
-    """Computes the state before a row from one some rows earlier, for many rows side by side.
+    """A run over the block of rows ahead of a row, to find the state before it; for many rows side by side.
 
     `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
     """
@@ -190,7 +190,7 @@ class WarmUpRun(NamedTuple):
 
     @property
     def ahead(self) -> int:
-        """Rows of a block."""
+        """Number of rows of a block."""
         return self.complete.size
 
     def states_before(self, rows: Int[np.ndarray, " n"], starts: PyTree, one_start_each: bool = False) -> PyTree | None:
@@ -212,8 +212,8 @@ class WarmUpRun(NamedTuple):
         choice = choose_code(means_after_settled_rows, arguments, [False, False, True, True, True])
         if choice.code is None:
             return None
-        results = self.settled.repeated(choice.results())
-        others = np.flatnonzero(~self.complete.cover(first, self.ahead))
+        results = self.settled.repeat_with_means(choice.results())
+        others = np.flatnonzero(~self.complete.are_complete(first, self.ahead))
         if len(others):
             filtered = self._filter_windows(take(states, others), take(windows, others), first[others])
             replace_chunk(results, others, filtered)
@@ -286,7 +286,7 @@ class ChunkPrograms(NamedTuple):
     complete: Callable[[SettledState, PyTree], PyTree]
 
 
-OF_ROWS = ChunkPrograms(scan_chunk, scan_settled_rows, SettledState.rows_of)
+OF_ROWS = ChunkPrograms(scan_chunk, scan_settled_rows, SettledState.fill_rows)
 OF_SUMS = ChunkPrograms(sum_chunk, sum_settled_rows, lambda settled, sums: sums)
 
 
@@ -325,7 +325,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
             for part, first, windows in take_windows_in_parts(rows, begun.first, length)
         ]
         joined = run_and_join(programs.settled, parts, [False, False, True, True, True, False])
-        return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
+        return None if joined is None else (settled.repeat_with_means(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_means_where_settled(begun, scan, scan_means)
     if results is None:

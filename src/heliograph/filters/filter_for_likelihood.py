@@ -1,4 +1,4 @@
-"""The filter whose innovations say how likely data are: by what plant, sensor and channel are."""
+"""Choice of the filter that a likelihood is computed by, by plant and channel: Kalman, linear, IMM or cubature."""
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.factories import cubature_filter, kalman_filter
@@ -16,7 +16,7 @@ from heliograph.random_affine.memory import memories
 
 
 def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:
-    """Return the filter that a likelihood is computed by.
+    """Return the filter by whose innovations a likelihood is computed, chosen by what plant and channel are.
 
     Args:
         plant: the plant; of several modes by `imm_filter`, of an unknown start by `kalman_filter`.

@@ -1,4 +1,4 @@
-"""States of linear filters: Gaussians, whose means depend on data, and what no data change; when two are the same.
+"""The Gaussians within a state of a linear filter: find, replace and compare them, beside what no data change.
 
 A state may hold the derivatives of a Gaussian behind it, in some numbers of a model. With the closed loop
 L = F (I - K H) an error of the mean falls as L^k, and its derivative as sum_j L^(k - j) L' L^(j - 1), by the same rate
@@ -39,7 +39,7 @@ def find_equal_states(
     # (number, other number, allowed difference besides roundings); the derivatives of a Gaussian come after it, and are
     # measured by its deviations.
     pairs = [(a, b, np.zeros(())) for a, b in zip(*map(_leaves_beside, (states, others)), strict=True)]
-    sizes = _size_slopes(others if among is None else among)
+    sizes = _find_largest_slopes(others if among is None else among)
     for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
         p, q = np.asarray(x.covariance), np.asarray(y.covariance)
         if isinstance(y, Gaussian):
@@ -60,7 +60,7 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return deviation, deviation[..., :, None] * deviation[..., None, :]
 
 
-def _size_slopes(states: PyTree) -> Iterator[float]:
+def _find_largest_slopes(states: PyTree) -> Iterator[float]:
     """Return of the derivatives in each number the largest among states (n, ...), in deviations of their Gaussian."""
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):

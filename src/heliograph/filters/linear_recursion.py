@@ -1,4 +1,4 @@
-"""Linear filters over the rows of a recording, as a recursion of a state of which data change the means alone."""
+"""Recursion of linear filters over the rows of a recording, of whose states data change the means alone."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from heliograph.numerics.types import Array, PyTree
 
 
 class Recursion(Module):
-    """Linear filters over rows (z, u): of their state, Gaussians and what no data change, only means depend on data."""
+    """Recursion of a linear filter over rows (z, u): data change only the means of the Gaussians in its state."""
 
     def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
         """Return the state after row k, and what is kept of the row."""
@@ -27,7 +27,7 @@ class Recursion(Module):
 
 
 class FilterRecursion(Recursion):
-    """A filter over rows, and what is kept of each: output(filter, state, innovation, k); `begin` is the first k."""
+    """Recursion of one filter, that puts out output(filter, state, innovation, k) of a row; `begin` is the first k."""
 
     filter: Any
     output: Callable[..., PyTree] = eqx.field(static=True)
@@ -41,7 +41,7 @@ class FilterRecursion(Recursion):
 
 
 def initial_state_if_linear(filter: Any) -> PyTree | None:
-    """Return the state of a filter before any row; None of one of which more than the mean depends on data."""
+    """Return the initial state of a linear filter; None where more than the mean of its state depends on data."""
     start = jax.tree.map(np.asarray, filter.init()) if getattr(filter, "is_linear", False) else ()
     return start if gaussians_of(start) else None
 

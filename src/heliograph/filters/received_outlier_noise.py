@@ -1,4 +1,4 @@
-"""Noise that may hold outliers, as it arrives behind a channel, and the channel without that noise."""
+"""Law of the noise that may hold outliers, as it arrives behind a channel, and the channel without that noise."""
 
 from typing import NamedTuple
 
@@ -66,7 +66,7 @@ class ReceivedNoise(Module):
     covariance: Float[jax.Array | np.ndarray, "m m"]
     degrees: Vector
 
-    def law(self, sensed: jax.Array) -> NoiseBranches:
+    def find_branches(self, sensed: jax.Array) -> NoiseBranches:
         """Return the mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
 
         Branch j of a noise before the gain arrives with mean E[g] m_j and variance

@@ -12,7 +12,7 @@ from heliograph.numerics.types import Int, PyTree
 Which = slice | np.ndarray  # some of several, by their numbers
 
 
-class Part(NamedTuple):
+class WindowBatch(NamedTuple):
     """Some of several windows: their numbers, the first row of each (n,), and their rows (n, length, ...)."""
 
     which: slice
@@ -20,13 +20,13 @@ class Part(NamedTuple):
     rows: PyTree
 
 
-def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> Iterator[Part]:
+def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> Iterator[WindowBatch]:
     """Yield windows as `take_windows` returns them: first those that are views, then the others."""
     total, place = len(jax.tree.leaves(rows)[0]), np.arange(len(begin)) * length
     views = int(np.sum((begin == place) & (place + length <= total)))
     for which in (slice(views), slice(views, None)):
         if len(first := begin[which]):
-            yield Part(which, first, take_windows(rows, first, length))
+            yield WindowBatch(which, first, take_windows(rows, first, length))
 
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:

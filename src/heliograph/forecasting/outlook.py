@@ -68,7 +68,7 @@ class Outlook(Module):
         """
         filter = self.filter
         if isinstance(filter, LimitedFilter):  # each part within the limits
-            state, filter = filter.condition(state), filter.base
+            state, filter = filter.condition_on_limits(state), filter.base
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))

@@ -1,4 +1,4 @@
-"""Best linear estimate from all reports that reached the fusion centre so far, with the nodes' errors as states."""
+"""Fusion of all reports that have reached the centre: a Kalman filter of the state and of all nodes' errors."""
 
 from typing import NamedTuple
 

@@ -28,7 +28,7 @@ def intersect_covariances(
     x_0 is the first of the means. Differences from it are used, since the matrices that multiply them have lost the
     digits that nearly dependent components cost: the means themselves may be millions of deviations from zero.
     """
-    covariance = invert(_sum_weighted(weights, information))
+    covariance = invert_positive_definite(_sum_weighted(weights, information))
     differences = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
     return means[0] + covariance @ differences, covariance
 
@@ -87,7 +87,7 @@ def _trace_derivatives(
     information: Float[jax.Array, "count n n"], w: Float[jax.Array, " count"]
 ) -> tuple[Float[jax.Array, ""], Float[jax.Array, " count"], Float[jax.Array, "count count"]]:
     """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
-    p = invert(_sum_weighted(w, information))
+    p = invert_positive_definite(_sum_weighted(w, information))
     half = information @ p  # J_k P
     full = p @ half
     hessian = 2 * symmetric(jnp.einsum("kab,jba->kj", half, full))
@@ -161,7 +161,7 @@ def intersect_inverse_covariances(
     def fuse_covariances(w: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return V and C at the weight w."""
         common = invert_covariances((w * p + (1 - w) * q)[None])[0]
-        return invert(p_information + q_information - common), common
+        return invert_positive_definite(p_information + q_information - common), common
 
     def halve_interval(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there."""
@@ -184,7 +184,7 @@ def intersect_inverse_covariances(
     return restore_exact_components(mean, symmetric(covariance), jnp.stack([a, b]), both)
 
 
-def invert(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
+def invert_positive_definite(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
     """Invert a positive definite matrix."""
     return symmetric(psd_solve(a, jnp.eye(len(a))))
 
@@ -207,7 +207,7 @@ def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
     # 1 / root of the variance of each component given those before it; rounding where that is next to none.
     _, scales = factor(a)
     is_small = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)
-    return invert(a + jnp.diag(is_small * least))
+    return invert_positive_definite(a + jnp.diag(is_small * least))
 
 
 def restore_exact_components(
@@ -264,7 +264,7 @@ def choose_shares_by_trace(believed: NeighbourEstimates, power: float, improveme
 
 def intersect_shares(believed: NeighbourEstimates, shares: Float[jax.Array, " degree"]) -> Shared:
     """Return the shares with the covariance (sum_j pi_j P_j^-1)^-1 of their intersection."""
-    return shares, invert(jnp.einsum("j,jab->ab", shares, believed.information))
+    return shares, invert_positive_definite(jnp.einsum("j,jab->ab", shares, believed.information))
 
 
 def intersection_weights(believed: NeighbourEstimates, shared: Shared) -> NeighbourWeights:

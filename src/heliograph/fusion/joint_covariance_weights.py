@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.fusion.covariance_intersection import invert
+from heliograph.fusion.covariance_intersection import invert_positive_definite
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
@@ -163,7 +163,7 @@ def solve_regularised_weights(
     ones = (arrived[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
     solved = psd_solve(total, ones) if degree * n <= WRITTEN else regular_solve(total, ones)
-    weights = (invert(ones.T @ solved) @ solved.T).reshape(n, degree, n)
+    weights = (invert_positive_definite(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
 
 

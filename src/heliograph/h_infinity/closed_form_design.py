@@ -1,4 +1,4 @@
-"""H-infinity design that needs no solver, behind a channel whose gains are known."""
+"""H-infinity design by a Riccati recursion, without a solver, behind a channel whose gains are known."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Checks of a function's growth over a box: its largest slope, a pair that breaks it, or a proof by intervals."""
+"""Check a function's growth (Lipschitz) constant over a box: largest slope, a pair that breaks it, a proof."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Coordinates of order one for the matrix inequalities of H-infinity designs, and the way back to the user's units."""
+"""Scaled coordinates in which the matrix inequalities of H-infinity designs are of order one, and the way back."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ RANK = 1e-12  # share of the largest correlation of received numbers below which
 SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
 
 
-class Coordinates(NamedTuple):
+class ScaledCoordinates(NamedTuple):
     """Scaled coordinates in which a design is computed, and the way back to the user's units.
 
     states: (x, e) = diag(S1, S2) times scaled ones, before every step and after the last. received: scales of what is
@@ -28,7 +28,7 @@ class Coordinates(NamedTuple):
     unit: float
     nothing_grows: bool
 
-    def sizes(self, k: int) -> tuple[float, float]:
+    def relative_scales(self, k: int) -> tuple[float, float]:
         """Return the scales of x and e before step k, over the larger of both.
 
         (1, 1) where nothing grows: S1 and S2 are matrices then, else multiples of the identity, since growth compares
@@ -39,21 +39,21 @@ class Coordinates(NamedTuple):
         x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
         return x / max(x, e), e / max(x, e)
 
-    def weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
+    def unscale_weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
         """Return the weight P_k in the user's units."""
         half = np.linalg.solve(self.states[k].T, scaled)
         return self.unit**2 * _symmetrise(np.linalg.solve(self.states[k].T, half.T))
 
-    def initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+    def scale_initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
         """Return the weight P_0 in scaled coordinates."""
         return _symmetrise(self.states[0].T @ weight @ self.states[0]) / self.unit**2
 
-    def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
+    def unscale_gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
         """Return the gain of step k in the user's units."""
         n = len(scaled)
         return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
 
-    def multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
+    def unscale_multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
         """Return the multipliers of step k in the user's units."""
         return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
@@ -65,7 +65,7 @@ def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
 
 def scale_steps(
     system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
-) -> tuple[list[StepMatrices], Coordinates]:
+) -> tuple[list[StepMatrices], ScaledCoordinates]:
     """Return the steps in coordinates in which all numbers are of order one, and the way back to the user's units.
 
     Scales are the deviations of x, e and what is received, if disturbances were independent noises of unit variance and
@@ -97,7 +97,7 @@ def scale_steps(
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
     # Levels in units of the largest root of E |M e|^2.
     unit = float(_nearest_power_of_four(np.sqrt(largest_target)))
-    coordinates = Coordinates(
+    coordinates = ScaledCoordinates(
         states=np.array(state_scales),
         received=np.array(received_scales),
         forms=np.array(form_scales),

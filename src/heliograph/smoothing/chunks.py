@@ -138,7 +138,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
     # Means alone are computed of chunks in which covariances stand still: that takes a window in which everything
     # arrived, and which does not reach beyond the last row.
-    is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
+    is_complete = begun.complete.are_complete(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & is_complete)
     results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
     if results is None:

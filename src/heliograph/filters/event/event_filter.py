@@ -1,4 +1,4 @@
-"""A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
+"""Filter behind a sender that decides when to send: Gaussians of the state and of what the sender compares y with."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -16,7 +16,7 @@ from heliograph.filters.event.event_filter_state import EventBelief
 from heliograph.filters.event.gaussian_sum import (
     FLOOR,
     GaussianSum,
-    concatenate,
+    concatenate_sums,
     log_total_weight,
     merge_groups,
     reduce_to_count,
@@ -105,7 +105,7 @@ class EventFilter(AbstractSizedFilter):
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
         prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+        return EventBelief.from_sum(self._pad_sum(prior_sum), begun, jnp.asarray(False))
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
         """Return a sum of one Gaussian, padded to the filter's number of Gaussians with copies of no weight."""
@@ -174,7 +174,7 @@ class EventFilter(AbstractSizedFilter):
             differences.append(received - expected)
             covariances.append(spread)
         innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
-        return EventBelief.of(parts, begun, state.moved), innovation
+        return EventBelief.from_sum(parts, begun, state.moved), innovation
 
     def _condition_on_sender(
         self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -239,11 +239,11 @@ class EventFilter(AbstractSizedFilter):
         """
         sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
         inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
-        pieces, _ = self.region.truncate_inside(inside, inside.take(0, 0), sender)
+        pieces, _ = self.region.truncate_inside(inside, inside.select_range(0, 0), sender)
         if self.loses:
             sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
             outside = self.region.truncate_outside(sent, sender, 1.0)
-            pieces = concatenate([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
+            pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
         return pieces.select_components(state_and_reference)
 
     def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
@@ -256,21 +256,23 @@ class EventFilter(AbstractSizedFilter):
         state_and_reference = np.arange(n + self.outputs)
         # Not sent: the reference as it was.
         unsent = augmented.relabel_sender(s, labels.unsent)
-        known, others = self.region.truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
+        known, others = self.region.truncate_inside(
+            unsent.select_range(0, self.known), unsent.select_range(self.known), sender
+        )
         # Sent and lost: y is the new reference, outside of the region, or anywhere where a heartbeat was due.
         outside = merge_groups(
             self.region.truncate_outside(augmented.relabel_sender(s, labels.dropped), sender, 1.0),
             self.region.count_outside_parts(sender),
         )
         anywhere = merge_groups(augmented.relabel_sender(s, labels.forced))
-        fresh = concatenate([outside, anywhere]).select_components(self._find_new_reference(sender))
+        fresh = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
         # Of all with a lost reference the pairs nearest in r are joined.
         few = reduce_to_count(
-            concatenate([others.select_components(state_and_reference), fresh]),
+            concatenate_sums([others.select_components(state_and_reference), fresh]),
             self.lost,
             slice(n + sender.start, n + sender.stop),
         )
-        return concatenate([known.select_components(state_and_reference), few])
+        return concatenate_sums([known.select_components(state_and_reference), few])
 
     def _condition_on_value(
         self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -304,12 +306,12 @@ class EventFilter(AbstractSizedFilter):
         # Restricted to where the sender had to send. The result holds several such blocks [updated, before] one after
         # the other, each in blocks of `size` by mode: they are sorted by mode again.
         count, size = len(links), len(label)
-        sent = self._restrict_to_sent(concatenate([*updated, *before]), s, begun)
-        pieces = [sent.take(start, start + size) for start in range(0, len(sent.log_weight), size)]
-        by_part = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
+        sent = self._restrict_to_sent(concatenate_sums([*updated, *before]), s, begun)
+        pieces = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
+        by_part = [concatenate_sums(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
         sent_updated, sent_before = by_part[:count], by_part[count:]
         # One Gaussian again, with a new reference.
-        merged = merge_groups(concatenate(sent_updated).select_components(self._find_new_reference(sender)))
+        merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
         merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], lost=False))
         signal = self._predict_sent_value(sent_before, links, sender)
         return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
@@ -323,7 +325,7 @@ class EventFilter(AbstractSizedFilter):
         for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
             received = predict_received(sum_of_mode.gaussian, link, sender, self.outputs)
             signals.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
-        return merge_groups(concatenate(signals)).gaussian
+        return merge_groups(concatenate_sums(signals)).gaussian
 
     def _restrict_to_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
@@ -336,7 +338,7 @@ class EventFilter(AbstractSizedFilter):
         mass = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
-        return concatenate([outside, floor, used.relabel_sender(s, due)])
+        return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
     def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""

@@ -1,4 +1,4 @@
-"""State of a filter behind a sender that decides when to send: a sum of Gaussians, and what is known of the sender."""
+"""State of a filter behind a sender that decides when to send: a Gaussian sum, and what is known of the sender."""
 
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ class EventBelief(NamedTuple):
         return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
 
     @staticmethod
-    def of(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
+    def from_sum(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """Return the state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
         return EventBelief(
             weight=jnp.exp(parts.log_weight), gaussian=parts.gaussian, label=parts.label, begun=begun, moved=moved

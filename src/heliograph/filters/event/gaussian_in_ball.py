@@ -1,4 +1,4 @@
-"""Moments of a Gaussian that is known to lie in a ball, or outside of it."""
+"""Log probability, mean and covariance of a Gaussian that is known to lie in a ball, or outside of it."""
 
 from typing import NamedTuple
 

@@ -45,7 +45,7 @@ class GaussianSum(NamedTuple):
         """Multiply all weights by exp(log_factor)."""
         return self._replace(log_weight=self.log_weight + log_factor)
 
-    def take(self, first: int, stop: int | None = None) -> "GaussianSum":
+    def select_range(self, first: int, stop: int | None = None) -> "GaussianSum":
         """Take the Gaussians first, ..., stop - 1."""
         few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
         return few
@@ -74,7 +74,7 @@ def log_total_weight(log_weight: jax.Array) -> jax.Array:
     return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
 
 
-def concatenate(parts: Sequence[GaussianSum]) -> GaussianSum:
+def concatenate_sums(parts: Sequence[GaussianSum]) -> GaussianSum:
     """Concatenate the Gaussians of several sums into one sum."""
     every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return every
@@ -93,7 +93,7 @@ def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) 
     row, centre = _project_on_direction(parts, direction)
     edges = jnp.full(2 * len(centre), edge)
     centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
-    return _truncate(concatenate([parts, parts]), centre, row, [edges])
+    return _truncate(concatenate_sums([parts, parts]), centre, row, [edges])
 
 
 def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -1,6 +1,7 @@
-"""Labels of a sender: probabilities of what is unknown of it, given each Gaussian of a sum.
+"""Probabilities of what is unknown of a sender (how long ago it sent, what was lost), given each Gaussian of a sum.
 
-A label is an array (K, M, A, C): Gaussian, mode of the link, steps since the last transmission, transmissions lost.
+They are the sender's label, an array (K, M, A, C): Gaussian, mode of the link, steps since the last transmission,
+transmissions lost.
 """
 
 from typing import NamedTuple

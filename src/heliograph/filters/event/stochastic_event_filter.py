@@ -11,7 +11,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.columns import WeightedColumns, eliminate, join_columns, zero_covariance
 from heliograph.factors.gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate, merge_groups, safe_log
+from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate_sums, merge_groups, safe_log
 from heliograph.filters.gaussian.gaussian_prediction import (
     predict_gaussian,
     second_moments_at_start,
@@ -175,7 +175,7 @@ class StochasticEventFilter(AbstractSizedFilter):
             is_down = down[0] > 0
             parts = [by_silence.scale_weights(jnp.where(is_down, -jnp.inf, 0.0))]
             parts += [part.scale_weights(jnp.where(is_down, 0.0, -jnp.inf)) for part in by_outage]
-        return merge_groups(concatenate(parts))
+        return merge_groups(concatenate_sums(parts))
 
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives."""

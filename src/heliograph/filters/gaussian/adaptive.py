@@ -108,7 +108,7 @@ class AdaptiveFilter(AbstractWrapper):
         # How a robust base weighs outliers: by its rule, else by the Gaussian branches of the noise's law. Another base
         # weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
-        law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
+        law = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
             predicted=predicted,
             shape_before=state.shape,

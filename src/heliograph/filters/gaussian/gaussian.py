@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from heliograph.factors.gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
-from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
 from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
 from heliograph.filters.gaussian.signal_moments import (
     ArrivedInnovation,
@@ -29,7 +29,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
-class GaussianFilter(AbstractBeliefFilter):
+class GaussianFilter(AbstractGaussianStateFilter):
     """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
 
     A linear plant or sensor needs no transform: its moments are exact.

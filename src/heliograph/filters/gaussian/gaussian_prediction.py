@@ -1,4 +1,4 @@
-"""Filters whose state is a mean and a covariance: their prior, prediction and estimate, and the one without data."""
+"""Filters whose state is a Gaussian: initial law, prediction and estimate, and the filter without measurements."""
 
 from functools import reduce
 from typing import Protocol
@@ -45,7 +45,7 @@ from heliograph.random_affine.noise import AbstractNoise
 MEAN_STEPS = 4  # to the mean of attitudes: of a deviation of 0.3 rad some 1e-9 are left
 
 
-class AbstractBeliefFilter(AbstractSizedFilter):
+class AbstractGaussianStateFilter(AbstractSizedFilter):
     """A filter whose state is a Gaussian, predicted by a transform, or exactly where the plant is linear.
 
     Shapes: initial_mean (n,), initial_covariance (n, n).
@@ -182,7 +182,7 @@ def choose_initial_moments(
     return mean, spread, initial_mean is not None or initial_covariance is not None
 
 
-class OpenLoop(AbstractBeliefFilter):
+class OpenLoop(AbstractGaussianStateFilter):
     """Prediction without measurements: the baseline for any use of them."""
 
     @property

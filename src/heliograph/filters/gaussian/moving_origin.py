@@ -1,4 +1,4 @@
-"""Gaussian filters whose mean is a high part and a low one, for precisions in which its place takes its digits."""
+"""Gaussian filters about an origin that moves with the estimate: a mean of a high and a low part, for few digits."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.factors.columns import unit_of
 from heliograph.factors.two_part_mean import SplitMeanGaussian, center_gaussian, center_known
 from heliograph.filters.base import AbstractFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, unstack
@@ -179,7 +179,7 @@ class CentredFilter(AbstractWrapper):
         return self.estimate(state)
 
 
-def make_moving_origin_filter(filter: AbstractBeliefFilter) -> AbstractFilter:
+def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFilter:
     """Return a filter about an origin that moves with it; one of attitudes or of modes of motion as it is.
 
     Args:

@@ -1,4 +1,4 @@
-"""A gate that gives in: the state is opened where what it refused for long says that it is wrong, and others do not."""
+"""A gate that recovers from locking out: it takes up a rival state once that explains what it refused for long."""
 
 from typing import Any, NamedTuple
 

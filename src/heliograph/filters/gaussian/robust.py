@@ -13,7 +13,7 @@ from heliograph.filters.base import (
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
 from heliograph.filters.gaussian.robust_scores import (
@@ -159,7 +159,7 @@ class StudentVB(AbstractWeightingRule):
         return used, following
 
 
-class RobustFilter(AbstractBeliefFilter):
+class RobustFilter(AbstractGaussianStateFilter):
     """Mean and covariance, corrected by the score of the noise law or by one update with weighted noise.
 
     Built by `robust_filter`. The channel is described without the noise that may hold outliers, whose law as it
@@ -190,7 +190,7 @@ class RobustFilter(AbstractBeliefFilter):
         z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
-            law = noise.law(sensed)
+            law = noise.find_branches(sensed)
             after = update_by_score(before, z, law)
             center, variance = law.mean_and_variance()
             return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)

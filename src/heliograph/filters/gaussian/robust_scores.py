@@ -127,12 +127,23 @@ class AbstractWeightingRule(Module):
 def update_with_weights(
     before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeightingRule
 ) -> ScoreUpdate:
-    """Return one joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; without components of weight zero."""
+    """Return one joint update by all of z (m,), its noise r_ij divided by sqrt(w_i w_j) with the weights w of a rule.
+
+    Args:
+        before: prediction of z without its noise.
+        z: what was received, NaN where a component did not arrive.
+        center: mean of the noise (m,).
+        noise: columns of the noise's covariance r.
+        rule: weighs the components. Those of weight zero are left out.
+    """
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
-    w, shown = rule.iterate(before, noise, e, arrived)
+    # A rule that iterates has weights of its last update, and newer ones that follow from it, which are reported.
+    w, reported_weights = rule.iterate(before, noise, e, arrived)
     after = joint_update(before, e, arrived & (w > SMALLEST), divide_noise_by_weights(noise, w))
-    return ScoreUpdate(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
+    # A rule is no law of the noise, so that there is no density of z: its place holds 0.
+    no_density = jnp.zeros_like(z[0])
+    return ScoreUpdate(after, weight=jnp.where(arrived, reported_weights, jnp.nan), log_density=no_density)
 
 
 def divide_noise_by_weights(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:

@@ -1,4 +1,4 @@
-"""What a sensor sends as a filter sees it, and what of it arrives: slopes in the state, and noise as a sum of squares.
+"""Moments of the signal that a sensor sends, and conditioning on what of it arrives: slopes in the state, and noise.
 
 Notation: the prior is x = m + L xi, xi uncorrelated with variances d; the sensor's signal is y = E y + slopes xi + v, v
 its noise and what of it is not linear in xi; z = G y + n is the measurement behind a channel, M = E[G].
@@ -98,10 +98,14 @@ def find_signal_moments(
 
 
 def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
-    """Return (|H| root E[x_i^2] + |E v|)^2 + Var v at the start, (p,): size of the terms that are summed in y.
+    """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
 
-    `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
-    moments before data grow without end where only inputs hold a plant.
+    Rounding acts on numbers of this size. It is taken at the start, once: the present estimate would make covariances
+    of a linear filter depend on data, and E[x_i^2] before data grows without end where only inputs hold a plant.
+
+    Args:
+        sensor: H and the law of v.
+        start: E[x_i^2] of the n states at the start, before any data (n,).
     """
     law = sensor.noise
     reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))

@@ -1,4 +1,4 @@
-"""Bounds behind a channel whose probabilities are uncertain, as Kalman updates of an inflated prior and noise.
+"""Bounds on the covariance behind a channel of uncertain law, as Kalman updates of an inflated prior and noise.
 
 Notation as in `update`: e the prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the
 measurement, M = E[G], H the slopes of y in the state and R the covariance of the rest of y.

@@ -263,12 +263,18 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
     gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
 
     def make_map(value: float, constant: np.ndarray) -> QuadraticMap:
-        """Return the map Y -> amplitude^2 value Y + constant of second moments of (y, 1)."""
+        """Return the map Y -> amplitude^2 value E[y y'] + constant of Y = E[(y, 1)(y, 1)'], of one gain for all of y.
+
+        As a tensor [i, j, a, b] its result is sum_ab center[i, j, a, b] Y[a, b]; the constant multiplies Y's last
+        corner, which is 1.
+        """
         center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
         center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))
         center[..., -1, -1] = constant
         return QuadraticMap(center, np.zeros_like(center))
 
+    # The gain's deviation from the nominal mean has a mean, at most `shift`, and a variance about it: together
+    # the second moment shift^2 + spread, beside that of the noise n. The power E[G y y' G'] is the signal's alone.
     zero = np.zeros_like(noise)
     return describe_second_moments(
         mean=np.concatenate([gain, np.zeros((len(noise), 1))], axis=1),

@@ -1,4 +1,4 @@
-"""Best linear filter behind a random channel with independent draws, and the choice among the others."""
+"""Best linear filter behind a random channel with independent draws, and the choice of the filter for others."""
 
 from collections.abc import Callable
 from dataclasses import replace

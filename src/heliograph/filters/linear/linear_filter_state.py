@@ -1,4 +1,4 @@
-"""State of a linear filter: the estimate, and the plant's moments without any data, both predicted with the plant."""
+"""State of a linear filter: the estimate, and the moments of the plant without any data; prediction of both."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Filters of powers and products of the measurement: a lift of z before a linear filter."""
+"""Polynomial filters: a linear filter of the monomials of the measurement, or of its products with an estimate."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -126,7 +126,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
 
 def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
-    """Return the mean of the state at the start (n,), zeros where nothing is subtracted."""
+    """Return E[x_0] (n,) of the unconditional mean `centre` that the filter subtracts; zeros where there is none."""
     start = np.zeros(n) if centre is None else centre.start
     mean: jax.Array = library(start).asarray(start)
     return mean

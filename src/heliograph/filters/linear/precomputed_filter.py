@@ -1,4 +1,4 @@
-"""Precomputed linear filters: gains and covariances for each step, where nothing but the mean depends on data."""
+"""Linear filters whose gains and covariances are computed for each step before any data; only the mean is left."""
 
 from dataclasses import replace
 from typing import NamedTuple, cast
@@ -45,7 +45,7 @@ class LinearStep(NamedTuple):
         """Return m = m- + K e."""
         return jnp.asarray(mean + self.gain @ innovation)
 
-    def keep(self) -> Float[jax.Array, "*node N N"]:
+    def error_transition(self) -> Float[jax.Array, "*node N N"]:
         """Return I - K C, which maps the predicted mean, and its error, to the corrected one."""
         return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
@@ -251,7 +251,7 @@ def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Arra
     )
 
 
-class Linearised(NamedTuple):
+class LinearisedStep(NamedTuple):
     """One step of a filter linearised at its estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
 
     Shapes: predicted m- (n,), gain K (n, m), output C (m, n), noise S (m, m); zero for what did not arrive.
@@ -263,7 +263,7 @@ class Linearised(NamedTuple):
     noise: jax.Array
 
 
-def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearisedStep:
     """Linearise a filter's correction at its prediction, with its covariance held.
 
     The filter's state is a Gaussian, or holds one. S = Cov(innovation) - C P C', for its predicted P.
@@ -274,7 +274,7 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
-    return Linearised(
+    return LinearisedStep(
         predicted=x.mean,
         gain=jnp.where(present, gain, 0.0),
         output=output,

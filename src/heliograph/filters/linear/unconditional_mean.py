@@ -1,4 +1,4 @@
-"""Mean of a linear model before any data, and the plant of the state less it: powers are taken about a mean."""
+"""Mean of the state of a linear model before any data, and the plant of the state less that mean."""
 
 from typing import TypeVar
 

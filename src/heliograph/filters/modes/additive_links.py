@@ -1,4 +1,4 @@
-"""Best linear filter behind links with memory that add up: it estimates one function of each link's mode.
+"""Best linear filter behind a sum of links with memory: state times functions of the mode of each link.
 
 The mean gain of a sum of links given their modes is a sum of functions of one link's mode each,
 E[H | modes] = Hbar + sum_a D_a phi_a, with phi_a = 1{mode of a link = j} - P(j) for all its modes j but the first,
@@ -124,7 +124,10 @@ class AdditiveModalFilter(AbstractModalFilter):
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of zeta+ = F zeta + noise."""
+        """Return the smoother step of zeta+ = F zeta + noise, zeta the products of x~ and functions of the modes.
+
+        `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
+        """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
         return smoother_step_of(step, moved, self.claim, projection=projection)

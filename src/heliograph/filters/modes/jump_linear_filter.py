@@ -238,7 +238,10 @@ class ModalFilter(AbstractJointModalFilter):
         return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of zeta+ = F zeta + noise."""
+        """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...).
+
+        `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
+        """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
         return smoother_step_of(step, moved, self.claim, projection=projection)
@@ -252,7 +255,7 @@ def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> ja
 
 def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> WeightedColumns:
     """Return columns of sum_i Cov(1{next} | i) x E_i (N, N), what the chain draws, from the moments E_i (M, s, s)."""
-    return separate_modes(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
+    return factor_with_last_mode(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
 
 
 def covariance_of_mode(rows: jax.Array) -> jax.Array:
@@ -260,7 +263,7 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
     return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
 
 
-def separate_modes(among: jax.Array) -> WeightedColumns:
+def factor_with_last_mode(among: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
 
     `among` (M - 1, s, M - 1, s): the covariance of all modes but the last, whose part is minus the sum of theirs.
@@ -312,7 +315,7 @@ def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, j
     """
     spread, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = from_covariance(start.initial_mean, start.initial_covariance)
-    mode = separate_modes((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
+    mode = factor_with_last_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
     # Factors of both, x before the indicator in each part.
     last = np.zeros((len(spread), len(spread)))
     last[-1, -1] = 1.0

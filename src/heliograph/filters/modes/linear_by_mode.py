@@ -1,4 +1,4 @@
-"""Linear plants and sensors of x~ = (x, 1) about a centre c, mode by mode: the parts of filters of jump systems.
+"""Transition, output and noise matrices of x~ = (x, 1) about a centre c, mode by mode, of filters of jump systems.
 
 All moments are those of (x - c, 1): a mean far from zero, which the modes' indicators multiply, would leave no digits
 for the rest.

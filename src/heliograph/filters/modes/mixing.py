@@ -1,4 +1,4 @@
-"""When the Gaussians of modes are merged, and how: mixtures of them by two moments, and what a plant makes of these."""
+"""When and how the Gaussians of modes are merged (GPB1, IMM, GPB2), and the prediction of the mixtures."""
 
 from collections.abc import Sequence
 from functools import partial

@@ -232,9 +232,8 @@ class MultipleModelFilter(AbstractSizedFilter):
             of_pairs = component[sensor_of_pair == number]
             once = np.unique(of_pairs)
             priors = parts if len(once) == len(parts.mean) else jax.tree.map(lambda leaf, i=once: leaf[i], parts)
-            signals = jax.vmap(lambda x, sensor=sensor: find_signal_moments(plant, sensor, self.transform, x, start))(
-                priors
-            )
+            measure = partial(find_signal_moments, plant, sensor, self.transform)
+            signals = jax.vmap(lambda x, measure=measure: measure(x, start))(priors)
             index = np.searchsorted(once, of_pairs)
             results.append(jax.tree.map(lambda leaf, index=index: leaf[index], signals))
         if len(results) == 1:

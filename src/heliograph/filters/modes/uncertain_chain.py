@@ -22,11 +22,11 @@ from heliograph.filters.modes.jump_linear_filter import (
     compute_initial_moments,
     concatenate_modes,
     condition_modes_on_received,
+    factor_with_last_mode,
     fields_of_joint_modes,
     mean_from_centre,
     predict_by_mode,
     rounding_of_received,
-    separate_modes,
     subtract_mean_output,
 )
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
@@ -111,7 +111,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         of_both = of_jumps + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * of_chain
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
-        by_modes = separate_modes(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
+        by_modes = factor_with_last_mode(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
         of_process = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
         return root, young, join_columns(by_modes, of_process)
 

@@ -1,4 +1,4 @@
-"""What particles expect of a measurement: the moments of its innovation over those where h(x) is a number."""
+"""Mean and covariance of the innovation, from what each particle expects of a measurement, where h(x) is a number."""
 
 import functools
 from typing import NamedTuple

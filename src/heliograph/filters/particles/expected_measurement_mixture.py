@@ -1,4 +1,4 @@
-"""What particles that are Gaussians in several modes expect of a measurement, and sums over them."""
+"""Mixture that each particle expects of a measurement, where particles are Gaussians by mode; sums of these."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Draws of the leading states of a Gaussian: the law of the others given them, and the density of what was drawn."""
+"""Draw the leading states of a Gaussian: the law of the others given them, and the density of what was drawn."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Particles of one run in the lanes of a processor's vectors: native code for one of them, called on all, row by row.
+"""Particle filters row by row in native code: compiled for one particle, called on all in the lanes of vectors.
 
 A run of many particles is no program of native code, which takes small arrays. But what is done with a particle is one,
 and keys and numbers of particles say what each draws. Three calls a row: particles move and are weighed, a lane each;

@@ -1,4 +1,4 @@
-"""Particle filter of which some states are drawn, and a Gaussian of the others stands in each particle (Rao-Blackwell).
+"""Rao-Blackwellised particle filter: some states and the modes are drawn, the others are a Gaussian given these.
 
 A particle is a mode, and a Gaussian of x = (d, l), drawn states first. Over a step, and before z is known, it is one
 Gaussian of each mode that may follow; with z one mode is drawn, then d, and l keeps its law given both.

@@ -1,4 +1,4 @@
-"""A step of a likelihood at an edge between two words, of a normal number: tails, densities, dithers that smooth it."""
+"""What a jump of a likelihood at the edge between two words adds to its sums over a normal number."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The filter behind words with two Gaussians: one if the last word was right in its leading bits, one if it was not."""
+"""Filter behind words with two Gaussians: given that the last word was right in its leading bits, or that not."""
 
 from functools import partial
 from typing import NamedTuple
@@ -99,7 +99,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         total = jnp.where(words.are_words, total, -jnp.inf)
         after = joint._replace(parts=take_leading(joint.parts, n))
         # The innovation is about what was expected by both hypotheses together, before the words.
-        signal = base.predict_signal(_merge(state), k)
+        signal = base.predict_signal(_merge_hypotheses(state), k)
         return after, base.compute_innovation(signal, words, z, at(base.numbers, k), total)
 
     @estimates
@@ -110,7 +110,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of one Gaussian of the mixture's moments."""
-        return smoother_step_by_transform(self.base, step.map_states(_merge), self.base)
+        return smoother_step_by_transform(self.base, step.map_states(_merge_hypotheses), self.base)
 
     def _split_by_answer(self, part: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
         """Condition one hypothesis on word i, and on each answer to whether its leading bits are right: yes, no.
@@ -118,7 +118,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,).
         """
         row = part.root[len(self.states) + i]
-        prior = self.base.prior_of(part, i)
+        prior = self.base.find_signal_prior(part, i)
         change = self.base.condition_by_leading_bits(i, words, prior, LEADING)
         mass = jnp.exp(change.log_mass)
         possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
@@ -169,7 +169,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         return jax.tree.map(lambda new, old: jnp.where(used, new, old), after, joint), total
 
 
-def _merge(state: Hypotheses) -> Gaussian:
+def _merge_hypotheses(state: Hypotheses) -> Gaussian:
     """Return one Gaussian of the mixture's mean and covariance."""
     return merge_mixture(*state)
 

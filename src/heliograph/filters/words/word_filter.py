@@ -1,4 +1,4 @@
-"""The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior.
+"""Filter behind words of finite length, whose bits may flip: exact moments of a Gaussian prior given each word.
 
 A word is a number that was rounded to low + i D, i = 0, 1, ..., and is sent as the bits of i. A dither is a random
 number that was added before the rounding; both ends know it where it is to be taken off.
@@ -15,7 +15,7 @@ from heliograph.factors.columns import WeightedColumns, join_columns, rounding_o
 from heliograph.factors.gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
 from heliograph.factors.repeated import triangularise_noise
 from heliograph.filters.base import Step, corrects
-from heliograph.filters.gaussian.gaussian_prediction import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
 from heliograph.filters.gaussian.signal_moments import Signal, find_signal_moments, innovation_covariance
 from heliograph.filters.words.bit_likelihoods import LinkOfBits
 from heliograph.filters.words.word_moments import WordEffect, find_effect_of_bits, find_effect_of_cell
@@ -32,7 +32,7 @@ from heliograph.random_affine.words.rounded import LARGEST
 OFF = 1e-6  # steps by which a received number may miss a word
 
 
-class WordFilter(AbstractBeliefFilter):
+class WordFilter(AbstractGaussianStateFilter):
     """The Gaussian filter that conditions on the received words themselves.
 
     Of y ~ N(m, S), component after component in the joint Gaussian of the state and what is measured, a word leaves the
@@ -73,7 +73,7 @@ class WordFilter(AbstractBeliefFilter):
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
         words = self.identify_received_words(z, at(self.links, k))
         for i in range(len(self.low)):
-            row, prior = joint.root[n + i], self.prior_of(joint, i)
+            row, prior = joint.root[n + i], self.find_signal_prior(joint, i)
             change = self._find_effect_of_word(i, words, prior)
             changes = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
             row = jnp.where(changes, row, 0.0)
@@ -137,7 +137,7 @@ class WordFilter(AbstractBeliefFilter):
             are_words=~jnp.any(no_word & arrived),
         )
 
-    def prior_of(self, joint: Gaussian, i: int) -> SignalPrior:
+    def find_signal_prior(self, joint: Gaussian, i: int) -> SignalPrior:
         """Return the law of y_i in that of the state and y."""
         place = len(self.states) + i
         return SignalPrior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))

@@ -1,4 +1,4 @@
-"""Mean error of a filter that is told numbers, before any: a bound without drawing them.
+"""Bound on the mean covariance of a filter over the numbers that its links may tell it, before any are drawn.
 
 Told numbers come with a message and say what the link did to it, such as its gain or a reading of that.
 """

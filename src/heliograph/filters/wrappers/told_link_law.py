@@ -88,7 +88,7 @@ class ToldFilter(AbstractWrapper):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the filter of the law that the numbers of the message give."""
-        values, numbers = self._split(jnp.asarray(z))
+        values, numbers = self._split_message(jnp.asarray(z))
         filter, is_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
         # Numbers that give no law make the state NaN, so that the message is refused where it came in.
@@ -111,7 +111,7 @@ class ToldFilter(AbstractWrapper):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter of the law that was told."""
-        values, numbers = self._split(jnp.asarray(step.z))
+        values, numbers = self._split_message(jnp.asarray(step.z))
         filter, _ = self._make_filter_given(numbers, step.k)
         return filter.smoother_step(step._replace(z=values))
 
@@ -150,7 +150,7 @@ class ToldFilter(AbstractWrapper):
             **sizes,
         )
 
-    def _split(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return values and numbers of a message; no value where a number is missing that it needs."""
         numbers = z[np.array(self.numbers)]
         suffices = ~jnp.isnan(numbers) | self._may_be_missing
