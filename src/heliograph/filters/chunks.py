@@ -228,24 +228,24 @@ class WarmUpRun(NamedTuple):
         return None if choice.code is None else choice.results()
 
 
-def _find_start_states(reach: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
+def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
     """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
 
     What a state holds beside its Gaussians, moments before any data, may never forget: then it is computed of all rows.
     `first` has the first rows of all chunks but the first one.
     """
-    starts = repeat_state(start, len(jax.tree.leaves(reach.rows)[0]) // reach.ahead)  # one each `ahead` rows
-    forgets = _start_is_forgotten(reach, starts, first)
-    if forgets is False and jax.tree.leaves(beside_gaussians(start)) and reach.settled is None:
-        starts = _replace_data_free_parts(reach.recursion, start, reach.rows, reach.ahead)
-        forgets = starts is not None and _start_is_forgotten(reach, starts, first)
+    starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
+    forgets = _start_is_forgotten(warm_up, starts, first)
+    if forgets is False and jax.tree.leaves(beside_gaussians(start)) and warm_up.settled is None:
+        starts = _replace_data_free_parts(warm_up.recursion, start, warm_up.rows, warm_up.ahead)
+        forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
     if not forgets:
         return None
-    reached = reach.states_before(first, starts)
+    reached = warm_up.states_before(first, starts)
     return jax.tree.map(lambda one, others: np.concatenate([one[None], others]), start, reached)
 
 
-def _start_is_forgotten(reach: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
+def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
     """Return whether a wrong start is forgotten `ahead` rows later; None without native code.
 
     This is tried before at most PROBES chunks, and must hold for more than half of them. It is forgotten where the
@@ -253,10 +253,10 @@ def _start_is_forgotten(reach: WarmUpRun, starts: PyTree, first: Int[np.ndarray,
     for every `ahead` rows; `first`: first rows of chunks.
     """
     probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
-    once, early = (reach.states_before(rows, starts) for rows in (probes, probes - reach.ahead))
+    once, early = (warm_up.states_before(rows, starts) for rows in (probes, probes - warm_up.ahead))
     if once is None:
         return None
-    twice = reach.states_before(probes, early, one_start_each=True)
+    twice = warm_up.states_before(probes, early, one_start_each=True)
     among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
     return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
 

@@ -78,7 +78,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """Return arrays of so many particles, a tree of what each is, to be filled."""
 
     @abstractmethod
-    def particles_of(self, state: Any) -> Any:
+    def get_particles(self, state: Any) -> Any:
         """Return what the particles (N, ...) of a state are."""
 
     @abstractmethod
@@ -107,7 +107,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     def compute_estimate(self, state: Any) -> Estimate:
         """Return the mean and covariance of all particles, by sums over them."""
-        weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.particles_of(state)))
+        weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.get_particles(state)))
         sums = self.sum_for_mean(weight, particles)
         return self.estimate_from_sums(sums, self.sum_for_covariance(weight, particles, sums))
 

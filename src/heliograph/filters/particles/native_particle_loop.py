@@ -270,7 +270,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
             return None
         loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
     else:
-        loop.set_particles(jax.tree.map(np.asarray, filter.particles_of(state)), np.asarray(state.log_weight))
+        loop.set_particles(jax.tree.map(np.asarray, filter.get_particles(state)), np.asarray(state.log_weight))
     # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
     steps = [
         loop.filter_row(DataRow(*row), choice_start)
@@ -341,7 +341,7 @@ class _ParticleLoop:
             held[...] = new
         self._choose_particles(choice_start)
         # Move and weigh; a row that no particle explains is not used: they are only moved.
-        used = self.filter.always_used or not np.isnan(row.z).all()
+        used = self.filter.uses_empty_rows or not np.isnan(row.z).all()
         largest = self._advance(used)
         excluded = used and not largest > -np.inf
         if excluded:
@@ -396,4 +396,4 @@ class _ParticleLoop:
     def last_state(self, key: np.ndarray) -> Any:
         """Return the state of the filter after the last row, given the key of what follows."""
         particles = jax.tree.map(lambda leaf: np.array(leaf[: self.count]), self.now)
-        return self.filter.state_of(particles, np.array(self.memory.log_weight[: self.count]), key)
+        return self.filter.make_state(particles, np.array(self.memory.log_weight[: self.count]), key)

@@ -82,7 +82,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     drawn: int = eqx.field(static=True)  # how many are drawn
 
     @property
-    def always_used(self) -> bool:
+    def uses_empty_rows(self) -> bool:
         """Return whether a row in which nothing arrived says something, of the modes."""
         return len(self.initial) > 1
 
@@ -91,7 +91,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
         key, own = self.start_keys()
         particles = self.draw_start(own, jnp.arange(self.particles))
-        return self.state_of(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+        return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def allocate_particles(self, count: int) -> Any:
         """Return arrays of so many particles, to be filled."""
@@ -100,11 +100,11 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         mean, lower, variances, log_mode = each
         return Cloud(Gaussian(mean, lower, variances), log_mode)
 
-    def particles_of(self, state: PartlyDrawn) -> Cloud:
+    def get_particles(self, state: PartlyDrawn) -> Cloud:
         """Return the Gaussian of each particle in each mode, and log probabilities of the modes."""
         return Cloud(state.gaussian, state.log_mode)
 
-    def state_of(self, particles: Cloud, log_weight: jax.Array, key: jax.Array) -> PartlyDrawn:
+    def make_state(self, particles: Cloud, log_weight: jax.Array, key: jax.Array) -> PartlyDrawn:
         """Return the state of particles with these log weights."""
         return PartlyDrawn(particles.gaussian, particles.log_mode, log_weight, key, jnp.asarray(True))
 
@@ -128,9 +128,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
         key, choice, own = self.keys_of_prediction(state.key)
         which, log_weight = self.choose_particles(state.log_weight, choice)
-        particles = jax.tree.map(lambda leaf: leaf[which], self.particles_of(state))
+        particles = jax.tree.map(lambda leaf: leaf[which], self.get_particles(state))
         moved, _ = self.move_particles(particles, None, own, jnp.asarray(u), k, state.moved)
-        return self.state_of(moved, log_weight, key)
+        return self.make_state(moved, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
@@ -189,12 +189,12 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
-        weighed = self.weigh_particles(self.particles_of(state), None, None, proposing, z, k)
+        weighed = self.weigh_particles(self.get_particles(state), None, None, proposing, z, k)
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         # All weights zero: the row is not used.
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
-        updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
-        used = (self.always_used | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
+        updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
+        used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
         after = update_if_used(used, updated, state._replace(key=key))
         return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
 

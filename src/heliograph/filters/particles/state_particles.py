@@ -70,13 +70,13 @@ class StateParticleFilter(AbstractStateParticleFilter):
     What is done with particles takes any of them side by side, by their numbers: all at once (None), or a lane each.
     """
 
-    always_used = False
+    uses_empty_rows = False
 
     def allocate_particles(self, count: int) -> np.ndarray:
         """Return an array of so many positions."""
         return np.zeros((count, len(self.states)))
 
-    def particles_of(self, state: StateParticles) -> jax.Array:
+    def get_particles(self, state: StateParticles) -> jax.Array:
         """Return the positions (N, n) of a state."""
         return state.position
 
@@ -85,9 +85,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Draw the particles from the law of x_0."""
         key, own = self.start_keys()
         x = self.draw_start(own, jnp.arange(self.particles))
-        return self.state_of(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+        return self.make_state(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
-    def state_of(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
+    def make_state(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
         """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
         size = position.shape[1]
         law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
@@ -156,7 +156,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
-        updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
+        updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
         after = update_if_used(used, updated, state._replace(key=key))
         return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
 

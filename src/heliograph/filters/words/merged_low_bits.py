@@ -22,7 +22,7 @@ Carried = tuple[
 ]  # sums, e^(-a^2 / (2 v)), r and a of a block's first cell
 
 
-def sum_merged(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
+def sum_merged_words(pairs: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
     """Return the sums over cells of 2^b fine words, an eighth to a quarter of a deviation wide, without the overloads.
 
     D is the step between words, l_0 and l_1 the likelihoods of a zero and a one of a bit. Within a merged cell the b

@@ -32,7 +32,7 @@ MOST = 20_000  # combinations of numbers that are summed over
 Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 
-class ToldContexts(NamedTuple):
+class ToldNumbersByMode(NamedTuple):
     """Numbers that may be told at a step, by mode of the chain that tells them; one mode where they are fresh.
 
     Shapes: numbers (modes, nodes, told), weights (modes, nodes) that sum to 1 in each mode, initial (modes,),
@@ -77,7 +77,7 @@ def mean_error_bound(
 
 
 @compile_in_float64
-def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array) -> jax.Array:
+def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array) -> jax.Array:
     """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`.
 
     In mode j of the chain that tells numbers, V+_j = sum_a P(a | j) f(sum_i b_ij V_i, a): f(P, a) is what is left of a
@@ -85,11 +85,11 @@ def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array)
 
     Args:
         filter: of a linear filter, told numbers with each message.
-        contexts: the numbers that each mode may tell, and the chain.
+        told: the numbers that each mode may tell, and the chain.
         u: inputs (steps, inputs).
     """
     start = filter.init()
-    modes = len(contexts.initial)
+    modes = len(told.initial)
 
     def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
         """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero."""
@@ -112,21 +112,21 @@ def _bound_mean_covariance(filter: ToldFilter, contexts: ToldContexts, u: Array)
             after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
             return prior, jnp.tensordot(weights, after, 1)
 
-        priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(contexts.numbers), jnp.asarray(contexts.weights))
+        priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(told.numbers), jnp.asarray(told.weights))
         # V of each mode of the next step: the mean over the modes that may come before it.
-        next_law = law @ contexts.transition
-        back = law[:, None] * contexts.transition / jnp.where(next_law > 0, next_law, 1.0)  # P(i now | j next)
+        next_law = law @ told.transition
+        back = law[:, None] * told.transition / jnp.where(next_law > 0, next_law, 1.0)  # P(i now | j next)
         mixed = jnp.einsum("ij,iab->jab", back, after)
         # All modes share the moments of the plant's state, so that one of their predictions goes on.
         return (jax.tree.map(lambda leaf: leaf[0], priors), mixed, next_law), jnp.tensordot(law, after, 1)
 
     covariances = jnp.broadcast_to(start.gaussian.covariance, (modes, *start.gaussian.covariance.shape))
-    carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(contexts.initial)
+    carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(told.initial)
     covariances_over_time: jax.Array = jax.lax.scan(bound_step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
     return covariances_over_time
 
 
-def _list_told_numbers(filter: ToldFilter) -> ToldContexts:
+def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
     """Return the numbers that a message may tell, with their probabilities, by mode of the chain that tells them.
 
     A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all
@@ -140,7 +140,7 @@ def _list_told_numbers(filter: ToldFilter) -> ToldContexts:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
         modes = chains[0].modes
         numbers = np.arange(float(modes))[:, None, None]
-        return ToldContexts(
+        return ToldNumbersByMode(
             numbers=numbers,
             weights=np.ones((modes, 1)),
             initial=np.asarray(chains[0].initial),
@@ -154,7 +154,9 @@ def _list_told_numbers(filter: ToldFilter) -> ToldContexts:
             raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
         values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
         weights = np.outer(weights, chances).ravel()
-    return ToldContexts(numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1)))
+    return ToldNumbersByMode(
+        numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1))
+    )
 
 
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
