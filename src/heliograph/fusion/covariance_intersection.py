@@ -222,6 +222,7 @@ def restore_exact_components(
     others say.
     """
     exact = jnp.diagonal(inputs, axis1=1, axis2=2) == 0
+    # From the last input to the first, so that of several exact ones the first is taken.
     for own, is_exact in zip(reversed(list(means)), reversed(list(exact)), strict=True):
         mean = jnp.where(is_exact, own, mean)
     is_exact = jnp.any(exact, axis=0)
@@ -232,7 +233,7 @@ Shared = tuple[Float[jax.Array, " degree"], Float[jax.Array, "n n"]]  # shares p
 
 
 def equal_shares(believed: NeighbourEstimates) -> Shared:
-    """Return one share for each estimate that arrived."""
+    """Return equal shares of the estimates that arrived, and the covariance of their intersection."""
     present = believed.present.astype(believed.traces.dtype)
     return intersect_shares(believed, present / present.sum())
 

@@ -124,6 +124,7 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Return diagonal weights: those that `weigh` gives to each component of the state by itself."""
     nodes, n = joint.shape[:2]
+    # The joint covariance of component a of all nodes: one of a state of that component alone, (node, 1, node, 1).
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
     return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))

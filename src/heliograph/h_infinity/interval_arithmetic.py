@@ -227,12 +227,13 @@ def _bound_absolute(a: Interval) -> Interval:
     return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, least), largest)
 
 
-def _extend_monotone(
+def _make_monotone_bound(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
     """Return the interval version of a function that never falls, whose values stay between `low` and `high`."""
 
     def call(a: Interval) -> Interval:
+        """Return the interval of the function's values on an interval of its argument."""
         values = round_outward(function(a.low), function(a.high), ULPS)
         return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
@@ -301,15 +302,15 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "one_minus_square": lambda a: ARITHMETIC["sub"](
         point_interval(np.ones_like(a.low)), _bound_square(a)
     ),  # a slope of tanh
-    "exp": _extend_monotone(np.exp, 0.0),
-    "log": _extend_monotone(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
-    "log1p": _extend_monotone(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
-    "expm1": _extend_monotone(np.expm1, -1.0),
-    "sqrt": _extend_monotone(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
+    "exp": _make_monotone_bound(np.exp, 0.0),
+    "log": _make_monotone_bound(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
+    "log1p": _make_monotone_bound(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
+    "expm1": _make_monotone_bound(np.expm1, -1.0),
+    "sqrt": _make_monotone_bound(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
     "rsqrt": lambda a: _bound_quotient(point_interval(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
-    "tanh": _extend_monotone(np.tanh, -1.0, 1.0),
-    "logistic": _extend_monotone(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
-    "atan": _extend_monotone(np.arctan),
+    "tanh": _make_monotone_bound(np.tanh, -1.0, 1.0),
+    "logistic": _make_monotone_bound(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
+    "atan": _make_monotone_bound(np.arctan),
     "sin": lambda a: _bound_cosine(round_outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS)),
     "cos": _bound_cosine,
 }

@@ -130,7 +130,7 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         """Carry the state after `step` over a later one, and estimate it given the data up to there."""
         after = later_step.ahead(point)
-        return after, start.estimate_from(start.settle(later_step.reached(after)))
+        return after, start.estimate_from(start.settle(later_step.find_law_of_earlier(after)))
 
     _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
     whole: Estimate = jax.tree.map(

@@ -64,7 +64,7 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
     return twin
 
 
-def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
+def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
     """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
     words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
     link = words[0] if len(words) == 1 else Stack(words)
@@ -140,7 +140,7 @@ def word_filter(
         initial_covariance=start.initial_covariance,
         sensor=at_each_step(_take_off_rounding, sensor),
         links=links,
-        numbers=at_each_step(partial(_describe_numbers, encoder), channel),
+        numbers=at_each_step(partial(_find_moments_of_numbers, encoder), channel),
         low=words.low,
         spacing=words.step,
         centre=words.centre,

@@ -134,9 +134,15 @@ class DiffusionWeights(_NeighbourRule):
         corrected, innovation = correct_by_information(predicted, jnp.asarray(step.complete))
         assert self.shares is not None
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
-        # What arrived alone corrects.
+        # The gains are those of all measurements; only what arrived corrects: F = I - P S of the measurements that did.
         used = jnp.eye(len(a)) - corrected @ step.arrived
-        return NodeGains(innovation @ a, shares[:, None] * jnp.ones(len(a)), corrected, used, corrected)
+        return NodeGains(
+            front=innovation @ a,
+            parts=shares[:, None] * jnp.ones(len(a)),
+            gain=corrected,
+            innovation=used,
+            covariance=corrected,
+        )
 
 
 class FrozenWeights(_NeighbourRule):

@@ -76,7 +76,14 @@ def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
     corrected, innovation = correct_by_information(predicted, jnp.asarray(step.arrived))
-    return NodeGains(innovation @ a @ weights.front, weights.parts, corrected, innovation, corrected)
+    # The gain W of measurements in information form, H' R^-1 z, is the covariance P after the step.
+    return NodeGains(
+        front=innovation @ a @ weights.front,
+        parts=weights.parts,
+        gain=corrected,
+        innovation=innovation,
+        covariance=corrected,
+    )
 
 
 def correct_by_information(
