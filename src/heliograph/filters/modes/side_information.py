@@ -182,7 +182,7 @@ class SideInformationFilter(AbstractSizedFilter):
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
         size = bound_signal_power_at_start(sensor, second_moments_at_start(self.plant))
-        received = _describe_received(prior, sensor, size, *links)
+        received = _make_measurement_model(prior, sensor, size, *links)
         # What z says of zeta, then the innovation as it is reported: NaN for what did not arrive.
         after, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
@@ -240,7 +240,7 @@ def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
     return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
 
-def _describe_received(
+def _make_measurement_model(
     state: SideInformationBelief,
     sensor: LinearSensor,
     size: jax.Array,

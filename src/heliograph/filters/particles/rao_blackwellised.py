@@ -209,7 +209,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
         sensors, (gaussian, log_mode) = models_of(at(self.sensor, k)), particles
         atoms, chance = at(self.density, k).given_arrivals(z)
-        received = self._describe_received(z, atoms)
+        received = self._find_atoms_by_mode(z, atoms)
         # That nothing or only a part arrived says something of the mode.
         log_mode = log_mode + jnp.log(chance)
         draws = draw_normals(key[0], numbers, self.drawn, self.particles)
@@ -222,7 +222,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         predicted = jax.vmap(partial(self._expect_received, sensors, received))(gaussian, log_mode)
         return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
-    def _describe_received(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
+    def _find_atoms_by_mode(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
         """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
         gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
         return ReceivedByMode(
