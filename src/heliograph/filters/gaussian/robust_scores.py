@@ -141,9 +141,11 @@ def update_with_weights(
     # A rule that iterates has weights of its last update, and newer ones that follow from it, which are reported.
     w, reported_weights = rule.iterate(before, noise, e, arrived)
     after = joint_update(before, e, arrived & (w > SMALLEST), divide_noise_by_weights(noise, w))
-    # A rule is no law of the noise, so that there is no density of z: its place holds 0.
-    no_density = jnp.zeros_like(z[0])
-    return ScoreUpdate(after, weight=jnp.where(arrived, reported_weights, jnp.nan), log_density=no_density)
+    return ScoreUpdate(
+        state=after,
+        weight=jnp.where(arrived, reported_weights, jnp.nan),
+        log_density=jnp.zeros_like(z[0]),  # a rule is no law of the noise: there is no density of z
+    )
 
 
 def divide_noise_by_weights(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
