@@ -28,25 +28,25 @@ ORDER = [
     [
         "filters.vector_check",
         "filters.call_checks",
-        "filters.filter_angles",
+        "filters.angle_indices",
         "filters.base",
         "filters.remark",
         "filters.sizes",
         "filters.plausibility",
-        "filters.states",
-        "filters.recursion",
-        "filters.windows",
+        "filters.gaussians_in_states",
+        "filters.linear_recursion",
+        "filters.row_windows",
         "filters.settled_covariance",
         "filters.chunks",
-        "filters.filter_data",
+        "filters.run_over_data",
         "filters.event.truncated_normal",
         "filters.truncation",
         "filters.smoother_step",
-        "filters.gaussian.transform",
+        "filters.gaussian.moment_transforms",
         "filters.gaussian.young_scalars",
-        "filters.gaussian.signal",
-        "filters.gaussian.bounds",
-        "filters.gaussian.update",
+        "filters.gaussian.signal_moments",
+        "filters.gaussian.uncertain_channel_bounds",
+        "filters.gaussian.uncertain_channel_updates",
     ],
     ["linear", "relays", "h_infinity"],
     ["filters"],
@@ -101,7 +101,7 @@ def import_graph() -> dict[str, set[str]]:
 def test_imports_never_go_round():
     """The error names the circle."""
     graph = import_graph()
-    assert "heliograph.filters.filter_data" in graph["heliograph.filters.base"]  # it sees what there is
+    assert "heliograph.filters.run_over_data" in graph["heliograph.filters.base"]  # it sees what there is
     TopologicalSorter(graph).prepare()
 
 

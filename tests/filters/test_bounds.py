@@ -11,8 +11,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.factors import from_covariance
-from heliograph.filters.gaussian.signal import Signal
-from heliograph.filters.gaussian.transform import PolynomialMoments, Transformed, image_of_moments
+from heliograph.filters.gaussian.moment_transforms import PolynomialMoments, Transformed, image_of_moments
+from heliograph.filters.gaussian.signal_moments import Signal
 from tests import machine
 from tests.filters.gaussian.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG

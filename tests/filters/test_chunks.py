@@ -118,7 +118,7 @@ def test_means_alone_move_where_rows_are_complete():
     item, u = hg.kalman_filter(WALK, PLACES), np.zeros((ROWS, 0))
     rows = chunks.FilterRecursion(item, lambda filter, state, innovation, k: innovation.log_likelihood)
     with jax.enable_x64(True):
-        begun = chunks.find_chunk_starts(rows, chunks.linear_start(item), (FEW_HOLES, u))
+        begun = chunks.find_chunk_starts(rows, chunks.initial_state_if_linear(item), (FEW_HOLES, u))
     assert np.flatnonzero(~begun.covered).tolist() == [0, 3, 4, 9, 19]
 
 

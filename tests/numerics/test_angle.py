@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
+from heliograph.filters.gaussian.moment_transforms import Cubature, Linearization, PolynomialMoments
 from heliograph.numerics import continue_angles, wrap_angles, wrap_near
 
 TURN = 2 * np.pi

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.relays.design import local_error_design, receiver_behind_relays
 from tests.oracles import successive_relays as oracle
 from tests.relays.relay_problems import example, network_of, relative, unusual

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork

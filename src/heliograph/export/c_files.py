@@ -16,7 +16,7 @@ from heliograph.export.program import RESERVED, Real, write_step_program
 from heliograph.export.text import CText, TextOptions, write_c_text
 from heliograph.export.window import check_window
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.trace_settings import use_precision, write_short_programs

@@ -11,10 +11,10 @@ from .base import (
 from .wrappers.clock import (
     clock_filter as clock_filter,
 )
-from .gaussian.bounds import (
+from .gaussian.uncertain_channel_bounds import (
     Scalars as Scalars,
 )
-from .wrappers.mean_error import (
+from .wrappers.mean_covariance_bound import (
     mean_error_bound as mean_error_bound,
 )
 from .wrappers.delay import (
@@ -38,17 +38,17 @@ from .innovation import (
 from .plausibility import (
     Judgement as Judgement,
 )
-from .likelihood_filter import (
+from .filter_for_likelihood import (
     likelihood_filter as likelihood_filter,
 )
 from .linear.linear import (
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )
-from .gaussian.belief import (
+from .gaussian.gaussian_prediction import (
     open_loop_filter as open_loop_filter,
 )
-from .modes.mixture import (
+from .modes.finite_support_filter import (
     mixture_filter as mixture_filter,
 )
 from .modes.multiple_model import (
@@ -71,20 +71,20 @@ from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
-from .filter_data import (
+from .run_over_data import (
     Filtered as Filtered,
 )
-from .linear.scheduled import (
+from .linear.scheduled_gains import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
 )
-from .gaussian.sequential import (
+from .gaussian.sequential_nodes import (
     sequential_filter as sequential_filter,
 )
 from .modes.side_information import (
     side_information_filter as side_information_filter,
 )
-from .gaussian.transform import (
+from .gaussian.moment_transforms import (
     AbstractTransform as AbstractTransform,
     Cubature as Cubature,
     Linearization as Linearization,
@@ -94,7 +94,7 @@ from .gaussian.transform import (
 from .gaussian.unscented import (
     Unscented as Unscented,
 )
-from .gaussian.update import (
+from .gaussian.uncertain_channel_updates import (
     AbstractUpdate as AbstractUpdate,
     Interval as Interval,
     Polytope as Polytope,

@@ -10,12 +10,12 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compile_on_call
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.filters.call_checks import call_with_inputs, call_with_state
 from heliograph.filters.chunks import ScanResult
-from heliograph.filters.filter_angles import FilterAngles
-from heliograph.filters.filter_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.plausibility import Judgement, judge_step
 from heliograph.filters.remark import Remark
+from heliograph.filters.run_over_data import Filtered, run_over_data, scan_inside_jit
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector
@@ -346,7 +346,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(predict, AbstractFilter.check_input, call_with_inputs)
+    return _compile_with_checks(predict, AbstractFilter.check_input, call_with_inputs)
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
@@ -355,7 +355,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
     """
-    return _check_calls(correct, AbstractFilter.check_measurement, call_with_state)
+    return _compile_with_checks(correct, AbstractFilter.check_measurement, call_with_state)
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
@@ -373,7 +373,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
     return cast(Callable[P, R], call)
 
 
-def _check_calls(
+def _compile_with_checks(
     function: Callable[P, R],
     check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]],
     call_checked: Callable[..., R],

@@ -1,4 +1,4 @@
-"""Calls of a filter's methods by a user: what is no state is said, and inputs of which a plant makes what is none."""
+"""Calls of a filter by a user: refuse a state that is none of the filter, and inputs that its plant cannot take."""
 
 from collections.abc import Callable
 from functools import cache
@@ -42,7 +42,7 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
     """
     if not filter.inputs or is_traced(filter, state, *data):
         return call_with_state(filter, state, function, *data)
-    result, spoilt = call_with_state(filter, state, _tell_whether_inputs_spoil(function), *data)
+    result, spoilt = call_with_state(filter, state, _wrap_with_input_test(function), *data)
     u, k = data[-2:]
     if spoilt:
         check_inputs(filter.inputs, np.asarray(u)[None], filter, int(k))
@@ -50,7 +50,7 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
 
 
 @cache
-def _tell_whether_inputs_spoil(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
+def _wrap_with_input_test(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
     """Return the function that also says whether the inputs spoil a step."""
 
     @compile_on_call

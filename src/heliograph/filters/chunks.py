@@ -21,14 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import (
+from heliograph.filters.gaussians_in_states import beside_gaussians, find_equal_states, means_of, with_gaussians
+from heliograph.filters.linear_recursion import (
     FilterRecursion,
     Recursion,
-    linear_start,
+    initial_state_if_linear,
     scan_chunk,
     state_after_rows,
     sum_chunk,
 )
+from heliograph.filters.row_windows import Which, run_and_join, take, take_windows, take_windows_in_parts
 from heliograph.filters.settled_covariance import (
     CompleteBlocks,
     SettledState,
@@ -39,8 +41,6 @@ from heliograph.filters.settled_covariance import (
     scan_settled_rows,
     sum_settled_rows,
 )
-from heliograph.filters.states import beside_gaussians, find_equal_states, means_of, with_gaussians
-from heliograph.filters.windows import Which, join_results, take, take_windows, take_windows_in_parts
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 
 CHUNKS = 16  # at least: two cores with eight lanes each
@@ -100,7 +100,7 @@ def filter_in_chunks(
         state: before the first row; that before any unless given.
         begin: number of the first row.
     """
-    start = linear_start(filter) if is_long(len(z)) else None
+    start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
     rows = FilterRecursion(filter, output, np.asarray(begin))
@@ -109,7 +109,7 @@ def filter_in_chunks(
 
 def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[..., PyTree]) -> PyTree | None:
     """Filter rows as `filter_in_chunks` does; return sums over all rows of what is kept of each, or None."""
-    start = linear_start(filter) if is_long(len(z)) else None
+    start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
     whole = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
@@ -145,19 +145,19 @@ def find_chunk_starts(recursion: Recursion, start: PyTree, rows: PyTree) -> Chun
             return None
         first = np.arange(0, total, lengths.chunk)
         complete = find_complete_blocks(rows[0], lengths.ahead)
-        whole = complete.cover(first, lengths.chunk)
+        whole = complete.are_complete(first, lengths.chunk)
         settled = find_settled_state(recursion, start, rows, lengths.ahead) if np.mean(whole) > 0.5 else None
         for law in [None] if settled is None else [settled, None]:
-            states = _find_start_states(WarmUp(recursion, rows, complete, law), start, first[1:])
+            states = _find_start_states(WarmUpRun(recursion, rows, complete, law), start, first[1:])
             if states is not None:
-                covered = whole & (False if law is None else law.covers(states))
+                covered = whole & (False if law is None else law.matches(states))
                 return ChunkStarts(
                     states=states, first=first, lengths=lengths, settled=law, covered=covered, complete=complete
                 )
     return None
 
 
-def _predict_moments_by_block(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
+def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> tuple[PyTree, PyTree]:
     """Return what a state holds beside its Gaussians, which no data change, after all blocks, and before each.
 
     `rows` (block, row, ...), of which the first has the number `first`.
@@ -177,8 +177,8 @@ def _predict_moments_by_block(recursion: Recursion, state: PyTree, rows: PyTree,
     return beside_gaussians(last), before
 
 
-class WarmUp(NamedTuple):
-    """Computes the state before a row from one some rows earlier, for many rows side by side.
+class WarmUpRun(NamedTuple):
+    """A run over the block of rows ahead of a row, to find the state before it; for many rows side by side.
 
     `settled`: covariances that stay as they are, of which only means are computed; None where they are not known.
     """
@@ -190,7 +190,7 @@ class WarmUp(NamedTuple):
 
     @property
     def ahead(self) -> int:
-        """Rows of a block."""
+        """Number of rows of a block."""
         return self.complete.size
 
     def states_before(self, rows: Int[np.ndarray, " n"], starts: PyTree, one_start_each: bool = False) -> PyTree | None:
@@ -212,8 +212,8 @@ class WarmUp(NamedTuple):
         choice = choose_code(means_after_settled_rows, arguments, [False, False, True, True, True])
         if choice.code is None:
             return None
-        results = self.settled.repeated(choice.results())
-        others = np.flatnonzero(~self.complete.cover(first, self.ahead))
+        results = self.settled.repeat_with_means(choice.results())
+        others = np.flatnonzero(~self.complete.are_complete(first, self.ahead))
         if len(others):
             filtered = self._filter_windows(take(states, others), take(windows, others), first[others])
             replace_chunk(results, others, filtered)
@@ -228,24 +228,24 @@ class WarmUp(NamedTuple):
         return None if choice.code is None else choice.results()
 
 
-def _find_start_states(reach: WarmUp, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
+def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
     """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
 
     What a state holds beside its Gaussians, moments before any data, may never forget: then it is computed of all rows.
     `first` has the first rows of all chunks but the first one.
     """
-    starts = repeat_state(start, len(jax.tree.leaves(reach.rows)[0]) // reach.ahead)  # one each `ahead` rows
-    forgets = _start_is_forgotten(reach, starts, first)
-    if forgets is False and jax.tree.leaves(beside_gaussians(start)) and reach.settled is None:
-        starts = _with_moments_before_data(reach.recursion, start, reach.rows, reach.ahead)
-        forgets = starts is not None and _start_is_forgotten(reach, starts, first)
+    starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
+    forgets = _start_is_forgotten(warm_up, starts, first)
+    if forgets is False and jax.tree.leaves(beside_gaussians(start)) and warm_up.settled is None:
+        starts = _replace_data_free_parts(warm_up.recursion, start, warm_up.rows, warm_up.ahead)
+        forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
     if not forgets:
         return None
-    reached = reach.states_before(first, starts)
+    reached = warm_up.states_before(first, starts)
     return jax.tree.map(lambda one, others: np.concatenate([one[None], others]), start, reached)
 
 
-def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
+def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
     """Return whether a wrong start is forgotten `ahead` rows later; None without native code.
 
     This is tried before at most PROBES chunks, and must hold for more than half of them. It is forgotten where the
@@ -253,22 +253,22 @@ def _start_is_forgotten(reach: WarmUp, starts: PyTree, first: Int[np.ndarray, " 
     for every `ahead` rows; `first`: first rows of chunks.
     """
     probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
-    once, early = (reach.states_before(rows, starts) for rows in (probes, probes - reach.ahead))
+    once, early = (warm_up.states_before(rows, starts) for rows in (probes, probes - warm_up.ahead))
     if once is None:
         return None
-    twice = reach.states_before(probes, early, one_start_each=True)
+    twice = warm_up.states_before(probes, early, one_start_each=True)
     among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
     return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
 
 
-def _with_moments_before_data(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
+def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
     """Return starts, one each `ahead` rows, with what a state holds there beside its Gaussians."""
     # BLOCKS blocks of `ahead` rows at a time.
     parts, state, size = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
         blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
                               take_windows(rows, np.array([begin]), size))  # fmt: skip
-        choice = choose_code(_predict_moments_by_block, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
+        choice = choose_code(_predict_data_free_parts, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
@@ -286,7 +286,7 @@ class ChunkPrograms(NamedTuple):
     complete: Callable[[SettledState, PyTree], PyTree]
 
 
-OF_ROWS = ChunkPrograms(scan_chunk, scan_settled_rows, SettledState.rows_of)
+OF_ROWS = ChunkPrograms(scan_chunk, scan_settled_rows, SettledState.fill_rows)
 OF_SUMS = ChunkPrograms(sum_chunk, sum_settled_rows, lambda settled, sums: sums)
 
 
@@ -315,7 +315,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
             (recursion, take(states, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
         ]
-        return join_results(programs.full, parts, [False, True, True, True, False])
+        return run_and_join(programs.full, parts, [False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
         """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
@@ -324,8 +324,8 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
             (recursion, settled, take(means, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first, length)
         ]
-        joined = join_results(programs.settled, parts, [False, False, True, True, True, False])
-        return None if joined is None else (settled.repeated(joined[0]), programs.complete(settled, joined[1]))
+        joined = run_and_join(programs.settled, parts, [False, False, True, True, True, False])
+        return None if joined is None else (settled.repeat_with_means(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_means_where_settled(begun, scan, scan_means)
     if results is None:

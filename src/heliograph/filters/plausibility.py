@@ -1,4 +1,4 @@
-"""Plausibility of data: an innovation's squared distance, which values are implausible, and why.
+"""Judge by the innovation's squared distance whether data are plausible; say which are not, and why.
 
 An implausible value is never used: a live estimator, a timeline and a recording refuse it and report it.
 """
@@ -29,7 +29,7 @@ LIMIT = 1e6
 An update moves the mean by up to d of its deviations, since K S K' <= P. So the mean is rounded to eps d of them, and
 what is a difference of second moments there (E[x x'] - m m', the second differences of a quadratic function) to eps d^2
 of the variance. At d = 1e6 these are 2e-10 and 2e-4 in double precision. In single precision nothing is left of second
-moments from d = eps^-1/2 = 2,900 on: the bound is there (`greatest_distance`). Any bound far below would be a
+moments from d = eps^-1/2 = 2,900 on: the bound is there (`largest_plausible_distance`). Any bound far below would be a
 statistical gate, which locks a filter out after an outage. Streams, timelines, services and recordings are in double.
 """
 
@@ -52,7 +52,7 @@ WORDS = {
 INPUT = "with it the mean loses its digits to rounding"
 
 
-def greatest_distance(dtype: np.dtype) -> float:
+def largest_plausible_distance(dtype: np.dtype) -> float:
     """Return the squared distance beyond which an update loses its digits: LIMIT squared or, if less, 1 / eps."""
     return min(LIMIT**2, 1 / float(np.finfo(dtype).eps))
 
@@ -130,7 +130,7 @@ class Judgement(NamedTuple):
         """Describe in words why something is implausible, with the bound of the precision that the distance has."""
         if Reason(int(reason)) != Reason.FAR:
             return WORDS[Reason(int(reason))]
-        most = np.sqrt(greatest_distance(np.asarray(distance).dtype))
+        most = np.sqrt(largest_plausible_distance(np.asarray(distance).dtype))
         bound = "1e6" if most == LIMIT else f"{most:,.0f}"
         far = f"more than {bound} deviations from what was expected"
         return far + (f" ({np.sqrt(distance):.3g} of them)" if np.isfinite(distance) else "")
@@ -174,11 +174,11 @@ def judge_step(
 ) -> Judgement:  # fmt: skip
     """Judge a step by its innovation, and by the states and estimates before it, after prediction and after correction.
 
-    A value is far where the components larger than expected are too many deviations off (`greatest_distance`): a
-    smaller one takes the mean to where it has more digits, so that an estimate which is far off can return. It is
-    excluded where all of it is determined and differs from the model, or where no atom of a mixture produces it. A
-    state is unsound where the one before it was not: a mean or variance that is no finite number, a negative variance,
-    an infinite number in it. So is a prediction.
+    A value is far where the components larger than expected are too many deviations off
+    (`largest_plausible_distance`): a smaller one takes the mean to where it has more digits, so that an estimate which
+    is far off can return. It is excluded where all of it is determined and differs from the model, or where no atom of
+    a mixture produces it. A state is unsound where the one before it was not: a mean or variance that is no finite
+    number, a negative variance, an infinite number in it. So is a prediction.
 
     Args:
         claim: of the filter; "none" where it claims no covariance, and nothing is judged by one.
@@ -195,7 +195,7 @@ def judge_step(
     is_sound = _is_sound_correction(after, claim, prior)
     loses_soundness = _is_sound_correction(prior, claim, before) & ~is_sound
     by_correction = loses_soundness | _overflows(state_prior, state_after)
-    loses_soundness = _is_finite_number(before, claim) & ~_is_sound_prediction(prior, claim)
+    loses_soundness = _are_finite(before, claim) & ~_is_sound_prediction(prior, claim)
     by_prediction = loses_soundness | _overflows(state_before, state_prior) | spoilt
     # The reason. Where several apply, prediction goes before far, that before unsound, and that before excluded.
     reason = jnp.where(of_value.far, Reason.FAR, jnp.where(of_value.excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
@@ -231,8 +231,9 @@ class _JudgedValue(NamedTuple):
 def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) -> _JudgedValue:
     """Judge a measurement z (m,) by its innovation e = z - expected and its covariance S.
 
-    Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `greatest_distance`. Excluded: every
-    component is determined by the model (no variance), and one of them differs; or, `of_atoms`, no atom produces z.
+    Far: components with |z| > |expected| whose squared distance e' S^-1 e exceeds `largest_plausible_distance`.
+    Excluded: every component is determined by the model (no variance), and one of them differs; or, `of_atoms`, no
+    atom produces z.
     """
     value, covariance, z = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance), jnp.asarray(z)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
@@ -247,7 +248,7 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
     if len(value) > 1:  # a single component has no others that are left out
         squares, determined = _squared_distance_terms_in_turn(value, covariance, larger, size)
     free = jnp.where(larger & ~determined, squares, 0.0)
-    most = greatest_distance(value.dtype)
+    most = largest_plausible_distance(value.dtype)
     far = jnp.any((free > most) | (larger & jnp.isinf(value))) | (jnp.sum(free) > most)
     # Excluded: all determined, and one of them differs; or no atom has a density at it, though its distance is finite.
     excluded = jnp.any(jnp.isinf(every) & certain) & ~jnp.any(~certain & present)
@@ -271,7 +272,7 @@ def _squared_distance_terms_in_turn(
     return jnp.where(used, squares, 0.0), used & determined
 
 
-def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
+def _are_finite(estimates: Estimate, claim: Claim) -> jax.Array:
     """Return whether all means are finite numbers, and the covariances too where one is claimed."""
     finite = ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.mean)))
     return finite if claim == "none" else finite & ~jnp.any(~jnp.isfinite(jnp.asarray(estimates.covariance)))
@@ -280,22 +281,22 @@ def _is_finite_number(estimates: Estimate, claim: Claim) -> jax.Array:
 def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
     """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before."""
     if claim == "none":
-        return _is_finite_number(estimates, claim)
+        return _are_finite(estimates, claim)
     variances_after = jnp.diagonal(jnp.asarray(estimates.covariance))
     variances_before = jnp.diagonal(jnp.asarray(before.covariance))
     # The rounding of a difference is as large as what it was taken from.
     size = jnp.where(jnp.isfinite(variances_before), jnp.abs(variances_before), 0.0)
     rounded = rounding(NEGATIVE_TOLERANCE, variances_after) * size
-    return _is_finite_number(estimates, claim) & ~jnp.any(variances_after < -rounded)
+    return _are_finite(estimates, claim) & ~jnp.any(variances_after < -rounded)
 
 
 def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
     """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it."""
     if claim == "none":
-        return _is_finite_number(prior, claim)
+        return _are_finite(prior, claim)
     variances = jnp.diagonal(jnp.asarray(prior.covariance))
     largest = jnp.max(jnp.abs(variances), initial=0.0)
-    return _is_finite_number(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
+    return _are_finite(prior, claim) & ~jnp.any(variances < -rounding(NEGATIVE_TOLERANCE, variances) * largest)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:

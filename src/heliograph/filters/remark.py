@@ -1,4 +1,4 @@
-"""What a filter says happened to its state."""
+"""Remark of a filter on what happened to its state: words, and how often, such as that a gate gave in."""
 
 from dataclasses import dataclass
 

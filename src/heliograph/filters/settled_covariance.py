@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.filters.recursion import Recursion, number_rows, sum_rows
-from heliograph.filters.states import ROUNDING, find_equal_states, means_of, select_state, with_means
-from heliograph.filters.windows import take
-from heliograph.numerics.process.repeated_rows_in_memory import repeat_row
+from heliograph.filters.gaussians_in_states import ROUNDING, find_equal_states, means_of, select_state, with_means
+from heliograph.filters.linear_recursion import Recursion, make_row_numbers, sum_rows
+from heliograph.filters.row_windows import take
+from heliograph.numerics.process.equal_rows import repeat_row
 from heliograph.numerics.types import Array, Bool, Int, PyTree
 from straightline import present
 
@@ -38,11 +38,11 @@ class SettledState(NamedTuple):
     outputs: PyTree
     varies: tuple[bool, ...]
 
-    def repeated(self, means: Sequence[np.ndarray]) -> PyTree:
+    def repeat_with_means(self, means: Sequence[np.ndarray]) -> PyTree:
         """Return states (n, ...) with these means (n, ...)."""
         return with_means(repeat_state(self.state, len(means[0])), means)
 
-    def rows_of(self, varying: list[np.ndarray]) -> PyTree:
+    def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
         """Return what is kept of rows (chunks, rows, ...), from the leaves that vary; the others are common."""
         chunks, rows = varying[0].shape[:2]
         leaves, form = jax.tree.flatten(self.outputs)
@@ -52,19 +52,19 @@ class SettledState(NamedTuple):
             return repeat_row(leaf, chunks * rows).reshape(chunks, rows, *leaf.shape)
 
         filled = [leaf if varies else fill(leaf) for leaf, varies in zip(leaves, self.varies, strict=True)]
-        return self._replace(outputs=jax.tree.unflatten(form, filled)).row_of(varying)
+        return self._replace(outputs=jax.tree.unflatten(form, filled)).fill_row(varying)
 
-    def row_of(self, varying: list[Any]) -> PyTree:
+    def fill_row(self, varying: list[Any]) -> PyTree:
         """Return what is kept of a row, from those of its leaves that vary; the others are common."""
         next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 
-    def varying_of(self, output: PyTree) -> list[Any]:
+    def select_varying(self, output: PyTree) -> list[Any]:
         """Return those leaves of what is kept of a row that vary."""
         return [leaf for leaf, v in zip(jax.tree.leaves(output), self.varies, strict=True) if v]
 
-    def covers(self, states: PyTree) -> Bool[np.ndarray, " n"]:
+    def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
         """Test which states (n, ...) are this one but for the means."""
         means = means_of(states)
         beside, own = (jax.tree.leaves(with_means(x, [()] * len(means))) for x in (states, self.state))
@@ -73,7 +73,9 @@ class SettledState(NamedTuple):
         covered: np.ndarray = np.all(same, axis=0)
         others = np.flatnonzero(~covered)
         if len(others):
-            covered[others] = find_equal_states(take(states, others), self.repeated([mean[others] for mean in means]))
+            covered[others] = find_equal_states(
+                take(states, others), self.repeat_with_means([mean[others] for mean in means])
+            )
         return covered
 
 
@@ -172,9 +174,9 @@ def scan_settled_rows(
         """Step over one row."""
         data, k = row
         after, outputs = step_settled(recursion, settled.state, means, data, k)
-        return select_state(k < count, means_of(after), means), settled.varying_of(outputs)
+        return select_state(k < count, means_of(after), means), settled.select_varying(outputs)
 
-    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, make_row_numbers(rows, first)))
 
 
 def sum_settled_rows(
@@ -199,7 +201,7 @@ def means_after_settled_rows(
         """Step over one row."""
         return means_of(step_settled(recursion, settled.state, means, *row)[0]), None
 
-    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, number_rows(rows, first)))[0]
+    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, make_row_numbers(rows, first)))[0]
 
 
 class CompleteBlocks(NamedTuple):
@@ -208,7 +210,7 @@ class CompleteBlocks(NamedTuple):
     size: int
     before: Int[np.ndarray, " blocks+1"]
 
-    def cover(self, begin: Int[np.ndarray, " n"], length: int) -> Bool[np.ndarray, " n"]:
+    def are_complete(self, begin: Int[np.ndarray, " n"], length: int) -> Bool[np.ndarray, " n"]:
         """Return which windows of rows lack no number; begin and length are multiples of the size."""
         first, end = (np.minimum(row // self.size, len(self.before) - 1) for row in (begin, begin + length))
         return np.asarray(self.before[end] - self.before[first] == end - first)

@@ -1,4 +1,4 @@
-"""Claim and sizes of a filter, as its class takes them."""
+"""Claim, names of states and inputs, and number of received components, of which a filter is made."""
 
 from typing import Protocol, TypedDict
 

@@ -152,7 +152,7 @@ class SmootherStep(Module):
         """Return the law of this step's state, its mean on the group, from one of changes from the mean after it."""
         return settle(self.manifold, self.after.mean, law)
 
-    def reached(self, point: EarlierState) -> Gaussian:
+    def find_law_of_earlier(self, point: EarlierState) -> Gaussian:
         """Return the mean and covariance of an earlier state given all data up to this step."""
         explained = WeightedColumns(point.through(self.after.root), self.after.variances)
         return from_columns(point.mean, join_columns(explained, point.noise))

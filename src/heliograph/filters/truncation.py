@@ -1,4 +1,4 @@
-"""Gaussians that are known to lie in an interval of one combination of their components."""
+"""Moments of Gaussians cut to an interval of one combination of their components, such as limits of a state."""
 
 from collections.abc import Sequence
 

@@ -10,7 +10,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.engine.choice import compute_once
-from heliograph.filters.filter_angles import FilterAngles
+from heliograph.filters.angle_indices import FilterAngles
 from heliograph.forecasting.forecast import ForecastTarget, list_targets
 from heliograph.forecasting.outlook import Moments, Outlook
 from heliograph.forecasting.scores import (

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead
 from heliograph.forecasting.origins import Sources, find_common_origin
 from heliograph.forecasting.outlook import (

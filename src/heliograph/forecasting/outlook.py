@@ -14,9 +14,9 @@ from heliograph.engine.choice import choose_code, compile_on_call, compute_once
 from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
@@ -68,7 +68,7 @@ class Outlook(Module):
         """
         filter = self.filter
         if isinstance(filter, LimitedFilter):  # each part within the limits
-            state, filter = filter.condition(state), filter.base
+            state, filter = filter.condition_on_limits(state), filter.base
         if isinstance(state, HasComponents):
             weights, parts = state.components
             parts = take_leading(parts, len(self.filter.states))
@@ -112,7 +112,7 @@ class Outlook(Module):
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""
-            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
+            signal = find_signal_moments(plant, sensor, self.transform, from_covariance(mean, covariance), start)
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)

@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .all_reports import (
+from .all_reports_fusion import (
     AllReports as AllReports,
 )
 from .report_link import (
@@ -48,6 +48,6 @@ from .rules import (
     WeightedFusion as WeightedFusion,
     fuse as fuse,
 )
-from .split_intersection import (
+from .split_covariance_intersection import (
     SplitIntersection as SplitIntersection,
 )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import LinearStep
+from heliograph.filters.linear.precomputed_filter import LinearStep
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.linalg import cholesky, rounding, symmetric, symmetrize
 from heliograph.numerics.numpy_or_jax import library
@@ -137,7 +137,7 @@ def make_initial_errors(
 def make_error_step(filters: LinearStep, motion: Motion, observation: JointObservation) -> ErrorStep:
     """Return the step of the errors of linear filters; `filters` has a leading axis of nodes."""
     # K, U = I - K C and L = K (M - C) of each node, with the letters of the first lines of this file.
-    gain, keep, n = jnp.asarray(filters.gain), filters.keep(), len(motion.shift)
+    gain, keep, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.shift)
     wrong_gain = gain @ _subtract_without_rounding(observation.gain, filters.output)
     # A - F, and U (b - f) - L b - K (o - c).
     matrices = _subtract_without_rounding(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)

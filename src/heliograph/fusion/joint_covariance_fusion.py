@@ -18,7 +18,7 @@ from heliograph.fusion.joint_covariance_weights import (
     weigh_covariance,
     weigh_covariance_by_component,
 )
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
@@ -92,7 +92,7 @@ class AbstractJointWeights(AbstractInformedFusion):
         """Compute W from P."""
         raise unwritten(self, "weights")
 
-    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+    def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Compute W from P for those estimates that are present, zero for the others."""
         raise unwritten(self, "arrived")
 
@@ -100,7 +100,7 @@ class AbstractJointWeights(AbstractInformedFusion):
         """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
-        weights = self.arrived(believed.joint, believed.present)
+        weights = self.weights_of_arrived(believed.joint, believed.present)
         return NeighbourWeights(
             jnp.eye(len(weights)), jnp.swapaxes(weights, 0, 1), weigh_covariance(weights, believed.joint)
         )
@@ -139,7 +139,7 @@ class MatrixWeights(AbstractJointWeights):
         """Return the matrix weights (n, node, n)."""
         return matrix_weights(joint)
 
-    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+    def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Return the weights of those that are present."""
         return solve_regularised_weights(joint, present)
 
@@ -161,7 +161,7 @@ class DiagonalWeights(AbstractJointWeights):
         """Return the diagonal weights (n, node, n)."""
         return diagonal_weights(joint)
 
-    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+    def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Return the weights of those that are present."""
         return solve_regularised_weights_by_component(joint, present)
 
@@ -193,6 +193,6 @@ class ScalarWeights(AbstractJointWeights):
         """Return the scalar weights times the identity (n, node, n)."""
         return scalar_weights(joint)
 
-    def arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
+    def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
         """Return the weights of those that are present."""
         return solve_regularised_scalar_weights(joint, present)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.fusion.intersection import invert
+from heliograph.fusion.covariance_intersection import invert_positive_definite
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
@@ -22,7 +22,7 @@ RIDGE = 1e-8  # share of a variance that each estimate is taken to have as indep
 Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
-def _check_joint(weights: Weights) -> Weights:
+def _with_joint_check(weights: Weights) -> Weights:
     """Decorate weights so that they refuse an array that is no joint covariance."""
 
     @wraps(weights)
@@ -36,7 +36,7 @@ def _check_joint(weights: Weights) -> Weights:
     return call
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute matrix weights: W_i with sum_i W_i = I that minimise W P W', for `joint` P (node, n, node, n).
@@ -99,7 +99,7 @@ def solve_factored_weights(
     return jnp.asarray(unbiased.reshape(n, nodes, n))
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute diagonal weights: the best for each component of the state by itself, for `joint` P (node, n, node, n).
@@ -110,7 +110,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     return _weigh_components(matrix_weights, jnp.asarray(joint))
 
 
-@_check_joint
+@_with_joint_check
 @compile_on_call
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Compute scalar weights: one number per node, W_i = w_i I, of least tr W P W', for `joint` P (node, n, node, n).
@@ -124,6 +124,7 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
 def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """Return diagonal weights: those that `weigh` gives to each component of the state by itself."""
     nodes, n = joint.shape[:2]
+    # The joint covariance of component a of all nodes: one of a state of that component alone, (node, 1, node, 1).
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
     return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
@@ -163,7 +164,7 @@ def solve_regularised_weights(
     ones = (arrived[:, None, None] * jnp.eye(n)).reshape(degree * n, n)
     # U^-1 E, and what makes the weights sum to I.
     solved = psd_solve(total, ones) if degree * n <= WRITTEN else regular_solve(total, ones)
-    weights = (invert(ones.T @ solved) @ solved.T).reshape(n, degree, n)
+    weights = (invert_positive_definite(ones.T @ solved) @ solved.T).reshape(n, degree, n)
     return unit[:, None, None] * weights / unit
 
 

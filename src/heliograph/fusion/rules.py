@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.fusion.intersection import (
+from heliograph.fusion.covariance_intersection import (
     choose_shares_by_trace,
     equal_shares,
     intersect_covariances,
@@ -17,8 +17,8 @@ from heliograph.fusion.intersection import (
     restore_exact_components,
     trace_optimal_weights,
 )
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.plant import AnyPlant, manifold_among
 from heliograph.numerics.angle import wrap_angles, wrap_near

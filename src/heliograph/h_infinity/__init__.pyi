@@ -4,7 +4,7 @@ from .certificate import (
     HInfinityCertificate as HInfinityCertificate,
     certify_level as certify_level,
 )
-from .closed_form import (
+from .closed_form_design import (
     known_channel_design as known_channel_design,
 )
 from .design import (
@@ -16,7 +16,7 @@ from .filter import (
     HInfinityFilter as HInfinityFilter,
     h_infinity_filter as h_infinity_filter,
 )
-from .growth_check import (
+from .lipschitz_check import (
     GrowthFinding as GrowthFinding,
     check_growth as check_growth,
 )

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.error_system import LARGEST, Growth, GrowthSystem, smallest_eigenvalue, symmetric_weight
-from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
+from heliograph.h_infinity.lipschitz_check import TOLERANCE, GrowthFinding
 from heliograph.numerics.check import TINY, array, fail, instance, items, scalar
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float

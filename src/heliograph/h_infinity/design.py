@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.h_infinity.coordinates import scale_steps
 from heliograph.h_infinity.error_system import LARGEST, GrowthSystem, symmetric_weight
+from heliograph.h_infinity.scaled_coordinates import scale_steps
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -104,7 +104,7 @@ def recursive_design(
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _check_initial_weight(initial, system.states)
-    recursion = _Recursion(system, objective, solver, flag("separate", separate))
+    recursion = _RecursiveDesigner(system, objective, solver, flag("separate", separate))
     search = flag("search", search)
     # At the given level, if there is one and it works; else the smallest level, by bisection.
     design = None if target is None else recursion.run(target, start)
@@ -157,8 +157,8 @@ def horizon_design(
     steps, coordinates = scale_steps(system, list_step_matrices(system, flag("separate", separate)), given_gains)
     given_correction = None if given_gains is None else np.zeros((n, m))
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
-    start = None if initial is None else coordinates.initial_weight(_check_initial_weight(initial, n))
-    allowed = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
+    start = None if initial is None else coordinates.scale_initial_weight(_check_initial_weight(initial, n))
+    allowed = coordinates.unit**2 * coordinates.scale_initial_weight(system.initial_weight)
     # One convex problem in all weights, gains, multipliers and the level squared.
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
@@ -177,12 +177,12 @@ def horizon_design(
         text = f"the solver's answer fails at step {failed} ({status})"
         return _make_unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
     # Back to the user's units.
-    found = [coordinates.gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)]
-    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(solved)])
+    found = [coordinates.unscale_gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)]
+    multipliers = np.array([coordinates.unscale_multipliers(u, k) for k, u in enumerate(solved)])
     return HInfinityDesign(
         level=float(np.sqrt(level_squared)) * coordinates.unit,
         gains=np.array(found) if given_gains is None else given_gains,
-        weights=np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)]),
+        weights=np.array([coordinates.unscale_weight(weight, k) for k, weight in enumerate(weights)]),
         multipliers=complete_multipliers(system, multipliers, separate),
         feasible=True,
         status=status,
@@ -204,7 +204,7 @@ def _find_first_failing(
     return None
 
 
-class _Recursion:
+class _RecursiveDesigner:
     """Recursive design over the horizon: one problem a step, compiled again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
@@ -228,11 +228,13 @@ class _Recursion:
         too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         if level_squared < LARGEST**-2:
             return too_low
-        largest = coordinates.unit**2 * coordinates.initial_weight(system.initial_weight)
-        weight = (1 - MARGIN) * largest if initial is None else coordinates.initial_weight(initial) / level_squared
+        largest = coordinates.unit**2 * coordinates.scale_initial_weight(system.initial_weight)
+        weight = (
+            (1 - MARGIN) * largest if initial is None else coordinates.scale_initial_weight(initial) / level_squared
+        )
         if np.linalg.eigvalsh(largest - weight)[0] <= 0 or np.linalg.eigvalsh(weight)[0] <= 0:
             return too_low
-        design.weights[0] = level_squared * coordinates.weight(weight, 0)
+        design.weights[0] = level_squared * coordinates.unscale_weight(weight, 0)
         # Step by step: the inequality, then gain, weight and multipliers in the user's units.
         for k, step in enumerate(self.steps):
             # The part of Phi that is known: M'M / level^2 - |(v, rho)|^2 - P_k.
@@ -243,9 +245,9 @@ class _Recursion:
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
             weight = _weigh_state_and_error(unknowns)
-            design.gains[k] = coordinates.gain(step.nominal + _gain_correction(unknowns), k)
-            design.weights[k + 1] = level_squared * coordinates.weight(weight, k + 1)
-            multipliers = level_squared * coordinates.multipliers(unknowns, k)
+            design.gains[k] = coordinates.unscale_gain(step.nominal + _gain_correction(unknowns), k)
+            design.weights[k + 1] = level_squared * coordinates.unscale_weight(weight, k + 1)
+            multipliers = level_squared * coordinates.unscale_multipliers(unknowns, k)
             design.multipliers[k] = complete_multipliers(system, multipliers, self.separate)
         return design._replace(feasible=True, status="optimal")
 
@@ -254,7 +256,7 @@ class _Recursion:
 
         A weight `start` that couples x and e makes a problem of its own.
         """
-        step, sizes = self.steps[k], self.coordinates.sizes(k + 1)
+        step, sizes = self.steps[k], self.coordinates.relative_scales(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
         for old_step, old_sizes, old_coupling, problem in self.compiled:
             same_step = all(map(np.array_equal, old_step, step)) and old_sizes == sizes

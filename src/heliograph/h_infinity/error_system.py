@@ -1,4 +1,4 @@
-"""The error system of H-infinity designs, and joint second moments of a channel's gain and of its noise's gain."""
+"""System of state and estimation error of an H-infinity design: matrices, growth constants, channel moments."""
 
 from typing import NamedTuple
 

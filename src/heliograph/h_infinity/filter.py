@@ -19,7 +19,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 
 
-class Pending(NamedTuple):
+class PendingCorrection(NamedTuple):
     """Last estimate (n,), and the correction (n,) by which the last measurement will change the next one."""
 
     mean: Float[jax.Array, " n"]
@@ -52,29 +52,29 @@ class HInfinityFilter(AbstractSizedFilter):
     initial_mean: np.ndarray
 
     @in_float64
-    def init(self) -> Pending:
+    def init(self) -> PendingCorrection:
         """Return the initial estimate, with no correction."""
         mean = jnp.asarray(self.initial_mean)
-        return Pending(mean, jnp.zeros_like(mean))
+        return PendingCorrection(mean, jnp.zeros_like(mean))
 
     @predicts
-    def predict(self, state: Pending, u: ArrayLike = (), k: Step = 0) -> Pending:
+    def predict(self, state: PendingCorrection, u: ArrayLike = (), k: Step = 0) -> PendingCorrection:
         """Predict over step k, corrected with the measurements before it."""
         mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
-        return Pending(mean, jnp.zeros_like(mean))
+        return PendingCorrection(mean, jnp.zeros_like(mean))
 
     @corrects
-    def correct(self, state: Pending, z: ArrayLike, k: Step = 0) -> tuple[Pending, Innovation]:
+    def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
         """Compute the correction of the next estimate from z; the current one stays."""
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
         # Without a covariance there is no likelihood; that of a step in which nothing arrives is 0 in logarithm.
         log_likelihood = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
         no_covariance = jnp.full((len(value), len(value)), jnp.nan)
-        return Pending(state.mean, correction), Innovation(value, no_covariance, log_likelihood)
+        return PendingCorrection(state.mean, correction), Innovation(value, no_covariance, log_likelihood)
 
     @estimates
-    def estimate(self, state: Pending) -> Estimate:
+    def estimate(self, state: PendingCorrection) -> Estimate:
         """Return the mean of the state, without a covariance."""
         n = state.mean.shape[0]
         return Estimate(state.mean, jnp.full((n, n), jnp.nan), self.claim)

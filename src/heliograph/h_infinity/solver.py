@@ -33,7 +33,7 @@ SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
 
 
-def import_solvers() -> ModuleType:
+def import_cvxpy() -> ModuleType:
     """Return the module cvxpy, imported; ModuleNotFoundError that says how to get it."""
     try:
         import cvxpy
@@ -52,7 +52,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
 def run_solver(problem: "Problem", solver: Solver) -> str:
     """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too."""
-    cp = import_solvers()
+    cp = import_cvxpy()
     solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Solution may be inaccurate")
@@ -104,7 +104,7 @@ class StepProblem:
             sizes: of x and e, in whose units the objective measures.
             start: the weight before the first step, which may couple x and e; None at all others.
         """
-        cp = import_solvers()
+        cp = import_cvxpy()
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
@@ -113,7 +113,7 @@ class StepProblem:
         # Objectives on L, one problem after another; `reached`: the best value of the first, which the next keeps.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
-        goals = _list_goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
+        goals = _list_objectives(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
         self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
 
     def _list_constraints(
@@ -152,7 +152,7 @@ class StepProblem:
         return status, self.layout.unpack(values)
 
 
-def _list_goals(
+def _list_objectives(
     cp: ModuleType,
     objective: Objective,
     weights: list["Expression"],
@@ -216,7 +216,7 @@ class HorizonProblem:
             weight: W, where P_0 <= level^2 W.
             initial: P_0; if None the largest allowed, nearly level^2 W.
         """
-        cp = import_solvers()
+        cp = import_cvxpy()
         self.layouts = layouts
         # One vector: the level squared (place 0), then each step's unknowns (places 1, 2, ...).
         sizes = [1, *(layout.size for layout in layouts)]
@@ -296,5 +296,5 @@ class HorizonProblem:
             columns.append(block_columns + self.places[index].start)
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         form = csr_array(entries, shape=(constant.size, self.unknowns.size))
-        matrix = import_solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
+        matrix = import_cvxpy().reshape(form @ self.unknowns, constant.shape, order="C") + constant
         self.constraints.append(matrix >> 0)

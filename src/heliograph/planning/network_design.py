@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Float

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Claim

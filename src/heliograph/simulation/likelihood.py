@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.chunks import sum_filtered_in_chunks
-from heliograph.filters.filter_data import check_data
+from heliograph.filters.run_over_data import check_data
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compile_in_float64

@@ -9,7 +9,7 @@ from zlib import crc32
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.linear.system import Schedule
 from heliograph.model.channel import Channel, check_link, find_received_angles

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import scan_in_chunks
-from heliograph.filters.recursion import Recursion
+from heliograph.filters.linear_recursion import Recursion
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy

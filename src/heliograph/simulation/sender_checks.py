@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.event_filter import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
+from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first

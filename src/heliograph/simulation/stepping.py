@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.linear.plan import LinearStep
+from heliograph.filters.linear.precomputed_filter import LinearStep
 from heliograph.filters.smoother_step import gaussian_of
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import Estimate

@@ -22,11 +22,11 @@ from heliograph.filters.chunks import (
     rescan_wrong_starts,
     scan_means_where_settled,
 )
-from heliograph.filters.recursion import linear_start, scan_chunk
+from heliograph.filters.gaussians_in_states import find_equal_states, select_state
+from heliograph.filters.linear_recursion import initial_state_if_linear, scan_chunk
+from heliograph.filters.row_windows import Which, take, take_windows
 from heliograph.filters.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
-from heliograph.filters.states import find_equal_states, select_state
-from heliograph.filters.windows import Which, take, take_windows
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.smoothing.fixed_interval_lag_point import sum_nis_over_blocks
@@ -48,7 +48,7 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
     """
-    start, rows = linear_start(filter), (np.asarray(z), np.asarray(u))
+    start, rows = initial_state_if_linear(filter), (np.asarray(z), np.asarray(u))
     if start is None:
         return None
     with jax.enable_x64(True):
@@ -138,7 +138,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
     # Means alone are computed of chunks in which covariances stand still: that takes a window in which everything
     # arrived, and which does not reach beyond the last row.
-    is_complete = begun.complete.cover(begun.first, own + ahead) & (begun.first + own + ahead <= total)
+    is_complete = begun.complete.are_complete(begun.first, own + ahead) & (begun.first + own + ahead <= total)
     begun = begun._replace(covered=begun.covered & is_complete)
     results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
     if results is None:

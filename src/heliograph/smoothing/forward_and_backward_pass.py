@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_data import check_data
+from heliograph.filters.run_over_data import check_data
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, instance
@@ -138,7 +138,7 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         """Carry the state after `step` over a later one, and estimate it given the data up to there."""
         after = later_step.ahead(point)
-        return after, start.estimate_from(start.settle(later_step.reached(after)))
+        return after, start.estimate_from(start.settle(later_step.find_law_of_earlier(after)))
 
     _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
     whole: Estimate = jax.tree.map(

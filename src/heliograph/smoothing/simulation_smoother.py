@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.factors.covariance_factors import square_root
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_data import check_data
+from heliograph.filters.run_over_data import check_data
 from heliograph.filters.smoother_step import SmootherStep
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import check_count, check_seed, fail, instance

@@ -15,11 +15,11 @@ import numpy as np
 from heliograph.engine.choice import choose_code
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.chunks import ChunkStarts
-from heliograph.filters.recursion import Recursion
+from heliograph.filters.gaussians_in_states import means_of, with_means
+from heliograph.filters.linear_recursion import Recursion
+from heliograph.filters.row_windows import take
 from heliograph.filters.settled_covariance import SettledState, find_settled_state, scan_settled_rows, step_settled
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, make_smoother_step
-from heliograph.filters.states import means_of, with_means
-from heliograph.filters.windows import take
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, PyTree
 
@@ -65,7 +65,7 @@ class BackwardRecursion(Recursion):
 
     def step(self, law: Gaussian, row: tuple[list[Array], Array], k: Array) -> tuple[Gaussian, Estimate]:
         """Smooth the state before a row from the law behind it, of which the row's estimate is."""
-        step = self.settled.row_of(row[0])
+        step = self.settled.fill_row(row[0])
         return step.back(law), step.estimate_from(law)
 
 
@@ -96,10 +96,10 @@ def smooth_settled_chunks(
         return None
     end, entered, left, estimates, nis = choice.results()
     return SmoothedChunk(
-        end=settled.repeated(end),
-        entered=smoothed.repeated(entered),
-        left=smoothed.repeated(left),
-        estimate=smoothed.rows_of(estimates),
+        end=settled.repeat_with_means(end),
+        entered=smoothed.repeat_with_means(entered),
+        left=smoothed.repeat_with_means(left),
+        estimate=smoothed.fill_rows(estimates),
         nis=nis,
         received=np.full(nis.shape, settled.outputs.received),
     )
@@ -135,10 +135,10 @@ def _smooth_settled(
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         """Return the smoothed means before a row from those behind it, and what varies of its estimate."""
         law, estimate = step_settled(back, smoothed.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
-        return means_of(law), smoothed.varying_of(estimate)
+        return means_of(law), smoothed.select_varying(estimate)
 
     law = [gaussian_of(with_means(settled.state, last)).mean]
     entered, _ = jax.lax.scan(pass_back, law, steps_behind, reverse=True)
     left, estimates = jax.lax.scan(pass_back, entered, steps, reverse=True)
-    nis = settled.row_of(steps).nis
+    nis = settled.fill_row(steps).nis
     return means_after, entered, left, estimates, jnp.broadcast_to(nis, (own,))

@@ -10,17 +10,17 @@ import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.belief import OpenLoop
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.gaussian.gaussian_prediction import OpenLoop
+from heliograph.filters.gaussian.sequential_nodes import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.linear.mean_before_data import UnconditionalMean
 from heliograph.filters.linear.polynomial import PolynomialFilter
-from heliograph.filters.linear.scheduled import LinearSystemFilter
-from heliograph.filters.modes.additive import AdditiveModalFilter
-from heliograph.filters.modes.arrival_patterns import SideInformation
-from heliograph.filters.modes.mixture import AtomCombinations, MixtureFilter
-from heliograph.filters.modes.modal import ChannelByMode, ModalFilter
+from heliograph.filters.linear.scheduled_gains import LinearSystemFilter
+from heliograph.filters.linear.unconditional_mean import UnconditionalMean
+from heliograph.filters.modes.additive_links import AdditiveModalFilter
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.finite_support_filter import AtomCombinations, MixtureFilter
+from heliograph.filters.modes.jump_linear_filter import ChannelByMode, ModalFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.modes.uncertain_chain import UncertainModalFilter
@@ -37,7 +37,7 @@ from heliograph.random_affine.moments.second_moment_map import QuadraticMap
 from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 
-Modes = TypeVar("Modes", SideInformation, ChannelByMode)  # a channel at one step, mode by mode
+Modes = TypeVar("Modes", ChannelByPattern, ChannelByMode)  # a channel at one step, mode by mode
 
 # Filters that hold the plant and the sensor at the ends of a channel.
 WithEnds = (

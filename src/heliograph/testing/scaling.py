@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.gaussian.sequential_nodes import SequentialFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.fusion.joint_covariance_fusion import ScalarWeights

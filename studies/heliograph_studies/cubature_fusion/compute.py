@@ -22,9 +22,9 @@ from heliograph.factors.covariance_factors import (
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal, condition_on_received
-from heliograph.filters.gaussian.transform import evaluate_beside_mean
-from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.filters.gaussian.moment_transforms import evaluate_beside_mean
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, condition_on_received
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.numerics.lapack import eigh

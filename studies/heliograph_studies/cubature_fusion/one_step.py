@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import heliograph as hg
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.numerics.check import array, scalar
 from heliograph.numerics.float64 import compile_in_float64, to_numpy
 from heliograph_studies.cubature_fusion.setting import OUTPUTS, Scenario, Transition, transition

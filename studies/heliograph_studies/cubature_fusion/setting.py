@@ -9,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.factored_gaussian import Gaussian
-from heliograph.filters.gaussian.bounds import as_scalars, observe_by_young, scalars_as_array
+from heliograph.factors.gaussian import Gaussian
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import ArrivedInnovation, Signal
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.gaussian.update import AbstractUpdate, combine_hop_ranges
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal
+from heliograph.filters.gaussian.uncertain_channel_bounds import (
+    condition_by_young_bound,
+    scalars_as_array,
+    scalars_from_array,
+)
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, combine_hop_ranges
 from heliograph.numerics.check import check_count
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph_studies import check_fields
@@ -44,11 +48,11 @@ class LooseInterval(AbstractUpdate):
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""
-        return hg.filters.Polytope(as_scalars(self.scalars))
+        return hg.filters.Polytope(scalars_from_array(self.scalars))
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
         """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return observe_by_young(signal, channel, z, self.scalars) if channel.uncertain else nominal
+        return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
 
 
 Transition = Callable[[jax.Array, object], jax.Array]

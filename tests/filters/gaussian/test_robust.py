@@ -143,7 +143,7 @@ def test_a_branch_before_a_random_gain_arrives_with_the_variance_that_draws_have
     plant = hg.LinearPlant([[1.0]], [[0.0]], [2.0], [[1e-12]])
     item = hg.robust_filter(plant, hg.LinearSensor([[1.0]], law), hg.hop(gain, 0.1))
     before, sensed = item.predict_received(item.init(), 0)
-    received = item.noise.law(sensed)
+    received = item.noise.find_branches(sensed)
     rng = np.random.default_rng(2)
     g = rng.rayleigh(np.sqrt(2 / np.pi), 200_000)
     for branch, (mean, variance) in enumerate([(0.0, 0.5), (3.0, 1.0)]):

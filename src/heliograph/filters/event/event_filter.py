@@ -1,4 +1,4 @@
-"""A filter behind a sender that decides when to send: a sum of Gaussians over what the sender compares with."""
+"""Filter behind a sender that decides when to send: Gaussians of the state and of what the sender compares y with."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -12,14 +12,14 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import Gaussian, append_rows, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.event.belief import EventBelief
+from heliograph.filters.event.event_filter_state import EventBelief
 from heliograph.filters.event.gaussian_sum import (
     FLOOR,
     GaussianSum,
-    concatenate,
-    log_total,
+    concatenate_sums,
+    log_total_weight,
     merge_groups,
-    reduce_parts,
+    reduce_to_count,
 )
 from heliograph.filters.event.joint_gaussian import (
     LinkMoments,
@@ -29,11 +29,11 @@ from heliograph.filters.event.joint_gaussian import (
     predict_with_reference,
     set_known_components,
 )
-from heliograph.filters.event.sender_labels import SilentLabels, relabel_sent
+from heliograph.filters.event.sender_status_probabilities import SilenceByCause, status_after_sending
 from heliograph.filters.event.silent_region import SilentRegion
-from heliograph.filters.gaussian.belief import second_moments_at_start, smoother_step_by_transform
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.arrival_patterns import SideInformation, pattern_of
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start, smoother_step_by_transform
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, pattern_of
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
@@ -57,7 +57,7 @@ class EventFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     trigger: AbstractThreshold
     initial: Float[Array, " M"]
     transform: AbstractTransform
@@ -105,7 +105,7 @@ class EventFilter(AbstractSizedFilter):
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
         prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
         begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.of(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+        return EventBelief.from_sum(self._pad_sum(prior_sum), begun, jnp.asarray(False))
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
         """Return a sum of one Gaussian, padded to the filter's number of Gaussians with copies of no weight."""
@@ -166,7 +166,7 @@ class EventFilter(AbstractSizedFilter):
             augmented = augment_by_signal(plant, sensor, self.transform, parts, start)
             arrived = jnp.any(~jnp.isnan(received))
             after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
-            log_likelihood_of_sender = log_total(after.log_weight)
+            log_likelihood_of_sender = log_total_weight(after.log_weight)
             log_likelihood += log_likelihood_of_sender
             parts = after.scale_weights(-log_likelihood_of_sender)
             # From now on the sender has a reference; where it is acknowledged, once a value arrived.
@@ -174,10 +174,10 @@ class EventFilter(AbstractSizedFilter):
             differences.append(received - expected)
             covariances.append(spread)
         innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
-        return EventBelief.of(parts, begun, state.moved), innovation
+        return EventBelief.from_sum(parts, begun, state.moved), innovation
 
     def _condition_on_sender(
-        self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+        self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
         """Condition the sum over (x, r, y) on what came from sender s, a value z or nothing (z all NaN).
 
@@ -203,7 +203,7 @@ class EventFilter(AbstractSizedFilter):
         return used
 
     def _condition_on_silence(
-        self, augmented: GaussianSum, channel: SideInformation, lost: jax.Array, s: int, begun: jax.Array
+        self, augmented: GaussianSum, channel: ChannelByPattern, lost: jax.Array, s: int, begun: jax.Array
     ) -> GaussianSum:
         """Condition the sum on silence: nothing was sent, or it was sent and lost.
 
@@ -222,16 +222,16 @@ class EventFilter(AbstractSizedFilter):
         # transmissions lost.
         unsent, due = self._split_label_by_sending(augmented.label[:, s], begun)
         loss = self._loss_probability(channel, s)[:, None, None]
-        dropped, forced = (relabel_sent(sent * loss, lost=True) for sent in (unsent, due))
+        dropped, forced = (status_after_sending(sent * loss, lost=True) for sent in (unsent, due))
         if self.trigger.losses == "known":  # told of a loss: it was sent; told of none: it was not
             unsent = jnp.where(lost > 0, 0.0, unsent)
             dropped, forced = (jnp.where(lost > 0, label, 0.0) for label in (dropped, forced))
         truncate = (
             self._truncate_with_lost_references if self.reference_may_be_lost else self._truncate_with_known_reference
         )
-        return self._keep_if_impossible(truncate(augmented, s, SilentLabels(unsent, dropped, forced)), augmented)
+        return self._restore_if_impossible(truncate(augmented, s, SilenceByCause(unsent, dropped, forced)), augmented)
 
-    def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilentLabels) -> GaussianSum:
+    def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, where r is known however many values were lost.
 
         Every Gaussian is cut to each piece of |y - r| <= delta, and of |y - r| > delta if values may be lost; those of
@@ -239,14 +239,14 @@ class EventFilter(AbstractSizedFilter):
         """
         sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
         inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
-        pieces, _ = self.region.truncate_inside(inside, inside.take(0, 0), sender)
+        pieces, _ = self.region.truncate_inside(inside, inside.select_range(0, 0), sender)
         if self.loses:
             sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
             outside = self.region.truncate_outside(sent, sender, 1.0)
-            pieces = concatenate([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
+            pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
         return pieces.select_components(state_and_reference)
 
-    def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilentLabels) -> GaussianSum:
+    def _truncate_with_lost_references(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, where a value that was lost is the next reference.
 
         First the Gaussians of known reference, joined piece by piece, then at most `lost` whose reference was lost.
@@ -256,24 +256,26 @@ class EventFilter(AbstractSizedFilter):
         state_and_reference = np.arange(n + self.outputs)
         # Not sent: the reference as it was.
         unsent = augmented.relabel_sender(s, labels.unsent)
-        known, others = self.region.truncate_inside(unsent.take(0, self.known), unsent.take(self.known), sender)
+        known, others = self.region.truncate_inside(
+            unsent.select_range(0, self.known), unsent.select_range(self.known), sender
+        )
         # Sent and lost: y is the new reference, outside of the region, or anywhere where a heartbeat was due.
         outside = merge_groups(
             self.region.truncate_outside(augmented.relabel_sender(s, labels.dropped), sender, 1.0),
             self.region.count_outside_parts(sender),
         )
         anywhere = merge_groups(augmented.relabel_sender(s, labels.forced))
-        fresh = concatenate([outside, anywhere]).select_components(self._find_new_reference(sender))
+        fresh = concatenate_sums([outside, anywhere]).select_components(self._find_new_reference(sender))
         # Of all with a lost reference the pairs nearest in r are joined.
-        few = reduce_parts(
-            concatenate([others.select_components(state_and_reference), fresh]),
+        few = reduce_to_count(
+            concatenate_sums([others.select_components(state_and_reference), fresh]),
             self.lost,
             slice(n + sender.start, n + sender.stop),
         )
-        return concatenate([known.select_components(state_and_reference), few])
+        return concatenate_sums([known.select_components(state_and_reference), few])
 
     def _condition_on_value(
-        self, augmented: GaussianSum, channel: SideInformation, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
+        self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
         """Condition on a value z: a Kalman update of each Gaussian, weighed by its density and by why it was sent.
 
@@ -304,13 +306,13 @@ class EventFilter(AbstractSizedFilter):
         # Restricted to where the sender had to send. The result holds several such blocks [updated, before] one after
         # the other, each in blocks of `size` by mode: they are sorted by mode again.
         count, size = len(links), len(label)
-        sent = self._select_sent(concatenate([*updated, *before]), s, begun)
-        pieces = [sent.take(start, start + size) for start in range(0, len(sent.log_weight), size)]
-        by_part = [concatenate(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
+        sent = self._restrict_to_sent(concatenate_sums([*updated, *before]), s, begun)
+        pieces = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
+        by_part = [concatenate_sums(pieces[j :: 2 * count]) for j in range(2 * count)]  # all blocks' piece j together
         sent_updated, sent_before = by_part[:count], by_part[count:]
         # One Gaussian again, with a new reference.
-        merged = merge_groups(concatenate(sent_updated).select_components(self._find_new_reference(sender)))
-        merged = merged.relabel_sender(s, relabel_sent(merged.label[:, s], lost=False))
+        merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
+        merged = merged.relabel_sender(s, status_after_sending(merged.label[:, s], lost=False))
         signal = self._predict_sent_value(sent_before, links, sender)
         return self._pad_sum(merged), signal.mean[0], signal.covariance[0]
 
@@ -323,9 +325,9 @@ class EventFilter(AbstractSizedFilter):
         for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
             received = predict_received(sum_of_mode.gaussian, link, sender, self.outputs)
             signals.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
-        return merge_groups(concatenate(signals)).gaussian
+        return merge_groups(concatenate_sums(signals)).gaussian
 
-    def _select_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
+    def _restrict_to_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
 
         Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
@@ -336,7 +338,7 @@ class EventFilter(AbstractSizedFilter):
         mass = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0)
         lowest = event.log_weight + np.log(FLOOR)
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
-        return concatenate([outside, floor, used.relabel_sender(s, due)])
+        return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
     def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
@@ -345,7 +347,7 @@ class EventFilter(AbstractSizedFilter):
         due = jnp.where(~begun | oldest, label, 0.0)
         return label - due, due
 
-    def _loss_probability(self, channel: SideInformation, s: int) -> jax.Array:
+    def _loss_probability(self, channel: ChannelByPattern, s: int) -> jax.Array:
         """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
         components = self.senders[s] if len(self.senders) > 1 else slice(None)
         lost = ~jnp.any(jnp.asarray(channel.present)[:, components], axis=1)  # by pattern of arrivals
@@ -359,11 +361,11 @@ class EventFilter(AbstractSizedFilter):
             places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
         return places
 
-    def _keep_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
+    def _restore_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
         """Return the updated sum `parts`; where all its weights are 0, the sum `before` with FLOOR as likelihood."""
         stays = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
-        forbidden = ~jnp.isfinite(log_total(parts.log_weight))
+        forbidden = ~jnp.isfinite(log_total_weight(parts.log_weight))
         either: GaussianSum = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
         return either
 

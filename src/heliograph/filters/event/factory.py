@@ -6,11 +6,11 @@ import jax
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
-from heliograph.filters.event.ball import MOST_COMPONENTS
 from heliograph.filters.event.event_filter import EventFilter
-from heliograph.filters.event.stochastic import StochasticEventFilter
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
+from heliograph.filters.event.gaussian_in_ball import MOST_COMPONENTS
+from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_by_noise
 from heliograph.model.fading import uncertain_chain
@@ -76,7 +76,7 @@ def event_filter(
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    loses = any(_may_lose(step) for step in steps)
+    loses = any(_may_lose_components(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     fields_of_both: dict[str, Any] = {  # of the filter of a random trigger, and of that of a threshold
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,
@@ -104,7 +104,7 @@ def event_filter(
     return on_premise(filter, premise)
 
 
-def _describe_channel(channel: Channel) -> tuple[SideInformation | OverTime, np.ndarray]:
+def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
     """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities."""
     drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
     if drifting:
@@ -125,23 +125,23 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
     if isinstance(trigger, Periodic):
         return lower_by_noise("exact", plant, sensor, channel)
     # Silence keeps a Gaussian one, where it is no hidden loss; that a value was sent must say nothing more than it.
-    losses_are_hidden = trigger.losses == "unknown" and any(_may_lose(step) for step in steps)
+    losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
     determined = all(_arrival_determines_y(step) for step in steps)
     is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
     return "exact" if is_exact else "nominal"
 
 
-def _may_lose(channel: SideInformation) -> bool:
+def _may_lose_components(channel: ChannelByPattern) -> bool:
     """Return whether with positive probability not all components arrive."""
     return bool(np.any(np.asarray(channel.chance)[:, ~np.all(channel.present, axis=1)] > 0))
 
 
-def _has_known_gain(channel: SideInformation) -> bool:
+def _has_known_gain(channel: ChannelByPattern) -> bool:
     """Return whether no gain is random, and what arrives is all that was sent, in every mode."""
     return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_spread(channel)[..., :-1, :-1])
 
 
-def _gain_and_noise_spread(channel: SideInformation) -> np.ndarray:
+def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
     """Return the spread of gain and noise by mode and pattern, zero where it is rounding of a known gain.
 
     E[G G'] - M M' of a known gain M is not more than some eps of |M M'|.
@@ -158,7 +158,7 @@ def _has_gaussian_noise(*models: PyTree) -> bool:
     return all(isinstance(leaf, Gaussian) for leaf in leaves if isinstance(leaf, AbstractNoise))
 
 
-def _arrival_determines_y(channel: SideInformation) -> bool:
+def _arrival_determines_y(channel: ChannelByPattern) -> bool:
     """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more."""
     # (mode, pattern) that can occur, of patterns in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
@@ -171,7 +171,7 @@ def _arrival_determines_y(channel: SideInformation) -> bool:
     return True
 
 
-def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
+def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
     """Return whether what arrives has the same mean and spread in every mode in which it can arrive."""
     possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
     for a, modes in enumerate(possible.T):
@@ -184,7 +184,7 @@ def _has_same_law_in_every_mode(channel: SideInformation) -> bool:
     return True
 
 
-def _delivers_y_unchanged(channel: SideInformation) -> bool:
+def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
     """Return whether what arrives is y itself, all of it."""
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
@@ -199,7 +199,7 @@ def _delivers_y_unchanged(channel: SideInformation) -> bool:
 
 
 def _check_threshold_rule(
-    rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[SideInformation]
+    rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[ChannelByPattern]
 ) -> AbstractThreshold:
     """Return the sending rule; raise ValueError where the Gaussian sum has no form for its region or its losses."""
     trigger = instance("trigger", rule, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these")
@@ -220,7 +220,7 @@ def _check_threshold_rule(
     return trigger
 
 
-def _has_independent_losses(channel: SideInformation) -> bool:
+def _has_independent_losses(channel: ChannelByPattern) -> bool:
     """Return whether components arrive unchanged, and are lost independently of each other, without modes."""
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:

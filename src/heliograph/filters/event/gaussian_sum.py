@@ -45,7 +45,7 @@ class GaussianSum(NamedTuple):
         """Multiply all weights by exp(log_factor)."""
         return self._replace(log_weight=self.log_weight + log_factor)
 
-    def take(self, first: int, stop: int | None = None) -> "GaussianSum":
+    def select_range(self, first: int, stop: int | None = None) -> "GaussianSum":
         """Take the Gaussians first, ..., stop - 1."""
         few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
         return few
@@ -67,14 +67,14 @@ def safe_log(x: jax.Array) -> jax.Array:
     return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
-def log_total(log_weight: jax.Array) -> jax.Array:
+def log_total_weight(log_weight: jax.Array) -> jax.Array:
     """Return log of the sum of weights; -inf where all are 0."""
     top = jnp.max(log_weight)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
 
 
-def concatenate(parts: Sequence[GaussianSum]) -> GaussianSum:
+def concatenate_sums(parts: Sequence[GaussianSum]) -> GaussianSum:
     """Concatenate the Gaussians of several sums into one sum."""
     every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return every
@@ -93,7 +93,7 @@ def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) 
     row, centre = _project_on_direction(parts, direction)
     edges = jnp.full(2 * len(centre), edge)
     centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
-    return _truncate(concatenate([parts, parts]), centre, row, [edges])
+    return _truncate(concatenate_sums([parts, parts]), centre, row, [edges])
 
 
 def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -119,7 +119,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
 
     def merge_group(parts: GaussianSum) -> GaussianSum:
         """Merge one group; where no component has weight, all count alike."""
-        total = log_total(parts.log_weight)
+        total = log_total_weight(parts.log_weight)
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
         return GaussianSum(total, merge_mixture(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
@@ -131,7 +131,7 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
     return few
 
 
-def reduce_parts(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
+def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
     """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
 
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.

@@ -17,9 +17,9 @@ from heliograph.factors.factored_gaussian import (
 )
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
-from heliograph.filters.gaussian.belief import image_of, process_noise
-from heliograph.filters.gaussian.signal import gain_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import factor_gain_noise, find_signal_moments
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.linalg import outer
@@ -47,7 +47,7 @@ def augment_by_signal(
 
     def augment_one(both: Gaussian) -> Gaussian:
         """Append y, which depends on x alone, to one Gaussian."""
-        signal = signal_of(plant, sensor, transform, take_leading(both, n), start)
+        signal = find_signal_moments(plant, sensor, transform, take_leading(both, n), start)
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
         return append_rows(
             both, signal.mean, slopes, triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
@@ -62,8 +62,8 @@ def predict_with_reference(
     """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data."""
     n = len(start)
     length_of_r = len(both.mean) - n
-    image = image_of(plant, transform, take_leading(both, n), u)
-    noise = sum_unexplained(image, process_noise(plant, u, start))
+    image = find_transition_moments(plant, transform, take_leading(both, n), u)
+    noise = sum_unexplained(image, factor_process_noise(plant, u, start))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
     slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), both.root[n:]])
     noise_of_both = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
@@ -132,5 +132,5 @@ def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Arra
     """Return E z, slopes and noise of z = G y + n, y the last m components."""
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
-    noise = join_columns(link.noise, gain_noise(link.gain_spread, second, centre))
+    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second, centre))
     return gain @ centre + link.mean[:, -1], gain @ rows, noise

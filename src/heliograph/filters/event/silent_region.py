@@ -1,4 +1,4 @@
-"""What silence says: the region in which the error of a sender's reference lies as long as it does not send."""
+"""Region in which y less the reference of its sender lies as long as the sender is silent; Gaussians cut to it."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.event.ball import truncate_to_ball
+from heliograph.filters.event.gaussian_in_ball import truncate_to_ball
 from heliograph.filters.event.gaussian_sum import (
     GaussianSum,
-    concatenate,
+    concatenate_sums,
     merge_groups,
     truncate_between,
     truncate_outside,
@@ -63,20 +63,20 @@ class SilentRegion(NamedTuple):
         # Each known Gaussian once for each piece [low, high], piece after piece, in units of delta.
         size, edges = len(known.log_weight), np.linspace(-1.0, 1.0, self.known + 1)
         low, high = (np.repeat(ends, size) for ends in (edges[:-1], edges[1:]))
-        cut = concatenate([known] * self.known)
+        cut = concatenate_sums([known] * self.known)
         if self.is_ball:
             if self.known > 1:  # a single piece is the whole ball
                 cut = truncate_between(cut, direction, low * delta, high * delta)
-            cut = self._truncate_to_ball(concatenate([cut, unknown]), sender, 1.0, inside=True)
+            cut = self._truncate_to_ball(concatenate_sums([cut, unknown]), sender, 1.0, inside=True)
         else:
             # The unknown ones from -delta to delta; then all by the interval of each other component.
             ones = np.ones(len(unknown.log_weight))
             low, high = np.append(low, -ones), np.append(high, ones)
-            cut = truncate_between(concatenate([cut, unknown]), direction, low * delta, high * delta)
+            cut = truncate_between(concatenate_sums([cut, unknown]), direction, low * delta, high * delta)
             for direction, delta in rest:
                 cut = truncate_between(cut, direction, -delta, delta)
         count = size * self.known
-        return merge_groups(cut.take(0, count), self.known), cut.take(count)
+        return merge_groups(cut.select_range(0, count), self.known), cut.select_range(count)
 
     def truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
         """Truncate each Gaussian to |y - r| > scale delta, as `count_outside_parts` pieces, one after the other.
@@ -92,7 +92,7 @@ class SilentRegion(NamedTuple):
                 parts = truncate_between(parts, direction, -edge, edge)
         if self.is_ball:
             outside.append(self._truncate_to_ball(parts, sender, scale, inside=False))
-        return concatenate(outside)
+        return concatenate_sums(outside)
 
     def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
         """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""

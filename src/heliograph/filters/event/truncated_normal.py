@@ -19,7 +19,7 @@ FAR = 4.0  # from there the tail is a continued fraction, before it a complement
 DEPTH = 32  # of the fraction, of which the variance at FAR has a relative error of 4e-14
 
 
-class TruncatedNormal(NamedTuple):
+class TruncatedNormalMoments(NamedTuple):
     """log P(lower <= e <= upper) of e ~ N(0, 1), and mean and variance of e in the interval."""
 
     log_mass: jax.Array
@@ -28,23 +28,23 @@ class TruncatedNormal(NamedTuple):
 
 
 PAIR = 2  # computed side by side: of one alone each operation waits for the one before
-Moments = Callable[..., TruncatedNormal]
+Moments = Callable[..., TruncatedNormalMoments]
 
 
 def _loop_two_intervals_at_a_time(moments: Moments) -> Moments:
     """Return the function as one operation, of which native code holds the code once, for PAIR intervals at a time."""
 
-    def compute_in_loop(*ends: jax.Array) -> TruncatedNormal:
+    def compute_in_loop(*ends: jax.Array) -> TruncatedNormalMoments:
         """Compute the moments pair after pair, or one by one of an odd number."""
         width = 1 if ends[0].size % PAIR else PAIR
         results = jax.lax.map(lambda pair: moments(*pair), [end.reshape(-1, width) for end in ends])
-        return TruncatedNormal(*(moment.reshape(ends[0].shape) for moment in results))
+        return TruncatedNormalMoments(*(moment.reshape(ends[0].shape) for moment in results))
 
     return operation(compute_in_loop)(moments)
 
 
 @_loop_two_intervals_at_a_time
-def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
+def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormalMoments:
     """Return log mass, mean and variance of N(0, 1) cut to [lower, upper], either of which may be infinite.
 
     The closed forms are differences of larger numbers: 1 + (a phi(a) - b phi(b)) / Z - m^2 is wrong, or negative, far
@@ -92,11 +92,11 @@ def truncated_normal(lower: jax.Array, upper: jax.Array) -> TruncatedNormal:
     mean = jnp.where(jnp.isinf(a) & jnp.isinf(b), 0.0, mean)
 
     log_mass = -(t**2) / 2 + jnp.log(integral) - np.log(2 * np.pi) / 2
-    return TruncatedNormal(log_mass, jnp.where(turned, -mean, mean), variance)
+    return TruncatedNormalMoments(log_mass, jnp.where(turned, -mean, mean), variance)
 
 
 @_loop_two_intervals_at_a_time
-def upper_tail(lower: jax.Array) -> TruncatedNormal:
+def upper_tail(lower: jax.Array) -> TruncatedNormalMoments:
     """Return log mass, mean and variance of N(0, 1) above `lower`, by a tenth of `truncated_normal`'s operations.
 
     With the hazard h = phi(a) / Q(a) the mean is h, the variance 1 - h (h - a). Far out both lose digits, but by
@@ -111,7 +111,7 @@ def upper_tail(lower: jax.Array) -> TruncatedNormal:
     a = jnp.clip(lower, -40.0, FAR)
     mass = jax.scipy.special.erfc(a / np.sqrt(2)) / 2
     hazard = jnp.exp(-(a**2) / 2) / (np.sqrt(2 * np.pi) * mass)
-    near = TruncatedNormal(jnp.log(mass), hazard, 1 - hazard * (hazard - a))
+    near = TruncatedNormalMoments(jnp.log(mass), hazard, 1 - hazard * (hazard - a))
     # Far out: u_n = n / (1 + x u_{n+1}), x = 1 / a^2, from u = 0 at DEPTH down to u_2 and u_1.
     a = jnp.maximum(lower, FAR)
     x, numerator, denominator = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
@@ -121,5 +121,5 @@ def upper_tail(lower: jax.Array) -> TruncatedNormal:
     u_1 = 1 / (1 + x * u_2)
     mean = a + u_1 / a
     log_mass = -(a**2) / 2 - np.log(2 * np.pi) / 2 - jnp.log(mean)
-    far = TruncatedNormal(log_mass, mean, x * u_1 * (u_2 - u_1))
-    return TruncatedNormal(*(jnp.where(lower < FAR, near_, far_) for near_, far_ in zip(near, far, strict=True)))
+    far = TruncatedNormalMoments(log_mass, mean, x * u_1 * (u_2 - u_1))
+    return TruncatedNormalMoments(*(jnp.where(lower < FAR, near_, far_) for near_, far_ in zip(near, far, strict=True)))

@@ -15,20 +15,20 @@ from heliograph.filters.base import (
     corrects,
     predicts,
 )
-from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
 from heliograph.filters.gaussian.robust import RobustFilter, predict_behind_channel, signal_without_noise
 from heliograph.filters.gaussian.robust_scores import (
     SMALLEST,
-    AbstractWeights,
+    AbstractWeightingRule,
     PredictedMeasurement,
-    branch_precision,
+    divide_noise_by_weights,
+    expected_branch_precision,
     expected_squared_residuals,
     joint_update,
-    reweight,
     update_by_score,
 )
-from heliograph.filters.robust_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
+from heliograph.filters.received_outlier_noise import NoiseBranches, ReceivedNoise, describe_outlier_noise
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
@@ -108,7 +108,7 @@ class AdaptiveFilter(AbstractWrapper):
         # How a robust base weighs outliers: by its rule, else by the Gaussian branches of the noise's law. Another base
         # weighs nothing.
         rule = base.rule if isinstance(base, RobustFilter) else None
-        law = noise.law(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
+        law = noise.find_branches(signal.mean) if isinstance(base, RobustFilter) and rule is None else None
         learned = _variational_update(
             predicted=predicted,
             shape_before=state.shape,
@@ -165,7 +165,7 @@ def _weigh_residuals(
     e: jax.Array,
     arrived: jax.Array,
     noise: jax.Array,
-    rule: AbstractWeights | None,
+    rule: AbstractWeightingRule | None,
     scaled_law: NoiseBranches | None,
     center: jax.Array,
     variance: jax.Array,
@@ -177,7 +177,7 @@ def _weigh_residuals(
     """
     # Branches: their expected precision is the weight, and their mean by it is taken off.
     if scaled_law is not None:
-        weight, shift = branch_precision(predicted, e + center, variance, scaled_law)
+        weight, shift = expected_branch_precision(predicted, e + center, variance, scaled_law)
         residual = jnp.where(arrived, e + center - shift, 0.0)
         return WeighedResiduals(residual=residual, weight=weight, reported=weight, received=arrived)
     if rule is not None:
@@ -195,7 +195,7 @@ def _variational_update(
     center: jax.Array,
     variance: jax.Array,
     memory: jax.Array,
-    rule: AbstractWeights | None,
+    rule: AbstractWeightingRule | None,
     law: NoiseBranches | None,
 ) -> VariationalUpdate:
     """Return the state x and the law of the noise variances R given z: x given R, then R given x, `ITERATIONS` times.
@@ -224,9 +224,9 @@ def _variational_update(
     e = jnp.where(arrived, z - predicted.signal - center, 0.0)
     noise = scale / shape
     for _ in range(ITERATIONS):
-        scaled_law = None if law is None else _scale_law(law, noise / variance)
+        scaled_law = None if law is None else _scale_branches(law, noise / variance)
         weighed = _weigh_residuals(predicted, e, arrived, noise, rule, scaled_law, center, variance)
-        used = reweight(_make_independent_noise(noise), weighed.weight)
+        used = divide_noise_by_weights(_make_independent_noise(noise), weighed.weight)
         squared = expected_squared_residuals(predicted, used, weighed.residual, weighed.received)
         noise = jnp.where(weighed.received, (scale + weighed.weight * squared / 2) / after_shape, noise)
     # The state with the variances before the last b.
@@ -248,7 +248,7 @@ def _make_independent_noise(variance: jax.Array) -> WeightedColumns:
     return WeightedColumns(np.eye(len(variance)), variance)
 
 
-def _scale_law(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
+def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
     """Return the noise's Gaussian branches scaled to variances `ratio` (m,) times as large."""
     ratio = ratio[:, None]
     return NoiseBranches(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)

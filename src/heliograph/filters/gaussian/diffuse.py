@@ -17,7 +17,7 @@ from heliograph.factors.diffuse_gaussian import (
     start_diffuse,
 )
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, second_moments_at_start
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import perfect
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
@@ -56,7 +56,7 @@ class DiffuseFilter(AbstractSizedFilter):
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
         """Predict x over x+ = A x + B u + w."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        noise = process_noise(plant, u, second_moments_at_start(self.plant))
+        noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         return predict_diffuse(state, plant.transition_matrix(u), plant.shift(u), noise)
 
     @corrects
@@ -80,7 +80,7 @@ class DiffuseFilter(AbstractSizedFilter):
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the Rauch-Tung-Striebel step, with finite and infinite factors."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
-        noise = triangularise(process_noise(plant, u, second_moments_at_start(self.plant)))
+        noise = triangularise(factor_process_noise(plant, u, second_moments_at_start(self.plant)))
         predicted = jnp.asarray(step.prior.mean)
         back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), predicted, noise)
         return SmootherStep(as_gaussian(step.after), back, claim=self.claim)

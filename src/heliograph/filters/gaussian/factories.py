@@ -1,14 +1,14 @@
 """Gaussian filters of plant, sensor and channel: Kalman's, the extended and the cubature filter, and a naive one."""
 
 from heliograph.filters.base import make_sizes
-from heliograph.filters.gaussian.belief import prior_of
 from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, has_unknown_start
 from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
-from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
+from heliograph.filters.gaussian.gaussian_prediction import choose_initial_moments
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, Linearization
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_by_noise
 from heliograph.model.fading import memory_matters, without_memory
@@ -51,7 +51,7 @@ def _make_gaussian_filter(
     channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
-    mean, covariance, prior_given = prior_of(start, initial_mean, initial_covariance)
+    mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     premise = Premise(plant, sensor, channel)  # what the claim rests on: the channel with its memory
     # Moments of the channel without its memory: where that matters, the described channel is not the true one.
     trusted = trusted and not memory_matters(channel)
@@ -212,7 +212,7 @@ def mean_gain_filter(
     )
 
 
-def gaussian_filter_of(
+def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
     """Return the Gaussian filter that another one stands on, refused behind a link of which anything is told.

@@ -7,17 +7,17 @@ import jax.numpy as jnp
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.factors.gaussian_on_group import settle
 from heliograph.filters.base import AbstractFilter, FilterAngles, Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.signal import (
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
+from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
+from heliograph.filters.gaussian.signal_moments import (
     ArrivedInnovation,
     Signal,
     condition_on_measurement,
+    find_signal_moments,
     make_received_noise,
-    signal_of,
 )
-from heliograph.filters.gaussian.two_part_mean import center_filter
-from heliograph.filters.gaussian.update import AbstractUpdate
-from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
+from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step, first
@@ -29,7 +29,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
-class GaussianFilter(AbstractBeliefFilter):
+class GaussianFilter(AbstractGaussianStateFilter):
     """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
 
     A linear plant or sensor needs no transform: its moments are exact.
@@ -60,7 +60,7 @@ class GaussianFilter(AbstractBeliefFilter):
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of the sensor's signal y at step k, from the state before its measurement."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
-        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
+        return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     @compile_in_float64
     def expect_signals(
@@ -107,7 +107,7 @@ class GaussianFilter(AbstractBeliefFilter):
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
-        return center_filter(self)
+        return make_moving_origin_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains, where they do not depend on data."""

@@ -13,20 +13,20 @@ from heliograph.filters.base import (
     Step,
     corrects,
 )
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.moving_origin import make_moving_origin_filter
 from heliograph.filters.gaussian.robust_scores import (
-    AbstractWeights,
+    AbstractWeightingRule,
     PredictedMeasurement,
     ScoreUpdate,
+    divide_noise_by_weights,
     expected_squared_residuals,
-    reweight,
     update_by_score,
-    update_weighted,
+    update_with_weights,
 )
-from heliograph.filters.gaussian.signal import Signal, make_received_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.gaussian.two_part_mean import center_filter
-from heliograph.filters.robust_noise import ReceivedNoise
+from heliograph.filters.gaussian.signal_moments import Signal, find_signal_moments, make_received_noise
+from heliograph.filters.received_outlier_noise import ReceivedNoise
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant
@@ -41,7 +41,7 @@ Number = Float[jax.Array | np.ndarray, ""]
 Degrees = Float[jax.Array | np.ndarray, " m"]
 
 
-class Huber(AbstractWeights):
+class Huber(AbstractWeightingRule):
     """Huber's weight w = min(1, c / |d|), d the innovation in its deviations: beyond c an error counts by its size.
 
     Source: Huber, Robust estimation of a location parameter (1964).
@@ -58,7 +58,7 @@ class Huber(AbstractWeights):
         return jnp.where(within, 1.0, self.c / jnp.sqrt(jnp.where(within, 1.0, squared)))
 
 
-class InverseMultiquadric(AbstractWeights):
+class InverseMultiquadric(AbstractWeightingRule):
     """Weight w = 1 / (1 + d^2 / c^2), d the innovation in its deviations: what is far loses all weight.
 
     Its covariance is that of the innovation, so that good values count after an outage, when the state is uncertain.
@@ -74,7 +74,7 @@ class InverseMultiquadric(AbstractWeights):
         return 1 / (1 + squared / self.c**2)
 
 
-class WoLF(AbstractWeights):
+class WoLF(AbstractWeightingRule):
     """Weight w = 1 / (1 + e^2 / (c^2 r)), by the noise's variance r alone (a squared weight of the likelihood).
 
     Source: Duran-Martin et al., Outlier-robust Kalman filtering through generalised Bayes (2024), freed of units by r.
@@ -90,14 +90,14 @@ class WoLF(AbstractWeights):
         return 1 / (1 + e**2 / (self.c**2 * scale))
 
 
-class Gate(AbstractWeights):
+class Gate(AbstractWeightingRule):
     """Chi-squared gate: w = 1 where d^2 <= c, else 0. It may lock a filter out after an outage, unless it gives in.
 
     Args:
         c: limit of the squared deviation d^2 (default 9).
         after: how many refusals of a number in a row open the state for it; None for none.
         seconds: for how long, where the plant has the input dt; None for none. Let it be so long that the other sensors
-            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.giving_in`).
+            tell a wrong sensor from a wrong state (`heliograph.filters.gaussian.recovering_gate`).
 
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation (2001).
     """
@@ -121,7 +121,7 @@ class Gate(AbstractWeights):
         return jnp.where(squared <= self.c, 1.0, 0.0)
 
 
-class StudentVB(AbstractWeights):
+class StudentVB(AbstractWeightingRule):
     """Variational Bayes for Student's noise: `iterations` updates from the prior, each with the last one's weights.
 
     w_i = (nu + 1) / (nu + E_i / r_i), E_i = (z_i - t_i+)^2 + V_ii+. The degrees nu are those of the noise law.
@@ -154,12 +154,12 @@ class StudentVB(AbstractWeights):
         used = following = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
         for _ in range(self.iterations):
             used = following
-            residual = expected_squared_residuals(before, reweight(noise, used), e, present)
+            residual = expected_squared_residuals(before, divide_noise_by_weights(noise, used), e, present)
             following = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / variance)
         return used, following
 
 
-class RobustFilter(AbstractBeliefFilter):
+class RobustFilter(AbstractGaussianStateFilter):
     """Mean and covariance, corrected by the score of the noise law or by one update with weighted noise.
 
     Built by `robust_filter`. The channel is described without the noise that may hold outliers, whose law as it
@@ -176,7 +176,7 @@ class RobustFilter(AbstractBeliefFilter):
     sensor: AnySensor
     channel: SecondOrder | OverTime
     noise: ReceivedNoise | OverTime
-    rule: AbstractWeights | None
+    rule: AbstractWeightingRule | None
     received_angles: Angles = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
@@ -190,16 +190,16 @@ class RobustFilter(AbstractBeliefFilter):
         z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
-            law = noise.law(sensed)
+            law = noise.find_branches(sensed)
             after = update_by_score(before, z, law)
             center, variance = law.mean_and_variance()
             return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)
-        after = update_weighted(before, z, noise.center, columns_of(noise.covariance), self.rule)
+        after = update_with_weights(before, z, noise.center, columns_of(noise.covariance), self.rule)
         return after.state, _innovation_about_mean(before, z, noise.center, noise.covariance, after)
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
-        return center_filter(self)
+        return make_moving_origin_filter(self)
 
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
         """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
@@ -214,7 +214,7 @@ def signal_without_noise(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
 ) -> Signal:
     """Return the moments of h(x) and the mean of its noise, without the noise's spread."""
-    return signal_of(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
+    return find_signal_moments(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from heliograph.filters.gaussian.belief import prior_of
-from heliograph.filters.gaussian.giving_in import GivingInFilter, build_giving_in_filter
+from heliograph.filters.gaussian.gaussian_prediction import choose_initial_moments
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.recovering_gate import GivingInFilter, build_giving_in_filter
 from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
-from heliograph.filters.gaussian.robust_scores import AbstractWeights
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.robust_noise import ReceivedNoise, Vector, separate_outlier_noise
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
+from heliograph.filters.gaussian.robust_scores import AbstractWeightingRule
+from heliograph.filters.received_outlier_noise import ReceivedNoise, Vector, separate_outlier_noise
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
@@ -40,7 +40,7 @@ def robust_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    rule: "AbstractWeights | None" = None,
+    rule: "AbstractWeightingRule | None" = None,
     transform: "AbstractTransform | None" = None,
     initial_mean: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
@@ -74,10 +74,10 @@ def robust_filter(
     start = check_plant(plant)
     check_link(first(sensor), first(channel), len(start.states), moments=False)
     if rule is not None:
-        instance("rule", rule, AbstractWeights, "one such as Huber(1.345), or None for the score update")
+        instance("rule", rule, AbstractWeightingRule, "one such as Huber(1.345), or None for the score update")
     move = Cubature() if transform is None else transform
     instance("transform", move, AbstractTransform, "one such as Cubature()")
-    mean, spread, _ = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, _ = choose_initial_moments(start, initial_mean, initial_covariance)
     # The channel without the noise that is weighed, and that noise. Its components must be independent where its law's
     # branches are used: by the score (no rule) and by StudentVB.
     needs_law = rule is None or isinstance(rule, StudentVB)

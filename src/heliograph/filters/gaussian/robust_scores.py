@@ -17,8 +17,8 @@ from heliograph.factors.factored_gaussian import (
     impose_moments_of_combination,
     take_leading,
 )
-from heliograph.factors.repeated_measurements import triangularise_noise
-from heliograph.filters.robust_noise import NoiseBranches
+from heliograph.factors.repeated import triangularise_noise
+from heliograph.filters.received_outlier_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 
 LARGEST = 1e150  # deviations of the widest branch: beyond, squares overflow
@@ -108,7 +108,7 @@ def _compute_score(e: jax.Array, v: jax.Array, log_share: jax.Array, mean: jax.A
 
 
 @readable
-class AbstractWeights(Module):
+class AbstractWeightingRule(Module):
     """Rule that weighs each component of a measurement: its noise r becomes r / w in one joint update."""
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
@@ -124,18 +124,31 @@ class AbstractWeights(Module):
         return w, w
 
 
-def update_weighted(
-    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeights
+def update_with_weights(
+    before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeightingRule
 ) -> ScoreUpdate:
-    """Return one joint update with noise r_ij / sqrt(w_i w_j), of mean `center`; without components of weight zero."""
+    """Return one joint update by all of z (m,), its noise r_ij divided by sqrt(w_i w_j) with the weights w of a rule.
+
+    Args:
+        before: prediction of z without its noise.
+        z: what was received, NaN where a component did not arrive.
+        center: mean of the noise (m,).
+        noise: columns of the noise's covariance r.
+        rule: weighs the components. Those of weight zero are left out.
+    """
     arrived = ~jnp.isnan(z)
     e = jnp.where(arrived, z - before.signal - center, 0.0)
-    w, shown = rule.iterate(before, noise, e, arrived)
-    after = joint_update(before, e, arrived & (w > SMALLEST), reweight(noise, w))
-    return ScoreUpdate(after, jnp.where(arrived, shown, jnp.nan), jnp.zeros_like(z[0]))
+    # A rule that iterates has weights of its last update, and newer ones that follow from it, which are reported.
+    w, reported_weights = rule.iterate(before, noise, e, arrived)
+    after = joint_update(before, e, arrived & (w > SMALLEST), divide_noise_by_weights(noise, w))
+    return ScoreUpdate(
+        state=after,
+        weight=jnp.where(arrived, reported_weights, jnp.nan),
+        log_density=jnp.zeros_like(z[0]),  # a rule is no law of the noise: there is no density of z
+    )
 
 
-def reweight(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
+def divide_noise_by_weights(noise: WeightedColumns, w: jax.Array) -> WeightedColumns:
     """Return r_ij / sqrt(w_i w_j): each row over the root of its weight."""
     return noise.through(jnp.diag(1 / jnp.sqrt(jnp.maximum(w, SMALLEST))))
 
@@ -154,7 +167,7 @@ def expected_squared_residuals(
     return (e - after.mean) ** 2 + after.columns.diagonal
 
 
-def branch_precision(
+def expected_branch_precision(
     before: PredictedMeasurement, e: jax.Array, scale: jax.Array, law: NoiseBranches
 ) -> tuple[jax.Array, jax.Array]:
     """Return the expected precision sum q_j r / r_j of each component's noise, and the noise's mean by it; (m,) each.

@@ -6,8 +6,8 @@ from heliograph.factors.covariance_factors import WeightedColumns, square_root
 from heliograph.factors.factored_gaussian import Gaussian, Image
 from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.transform import AbstractTransform, Function, evaluate_beside_mean
-from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Function, evaluate_beside_mean
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first

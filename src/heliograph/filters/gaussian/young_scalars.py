@@ -27,7 +27,7 @@ Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(b
 
 
 def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
-    """Return the scalars beta of Young's inequality that minimise tr P; those that are `given` (not NaN) stay.
+    """Return the scalars beta of Young's inequality that minimise tr P, or those that are given.
 
     At the minimum beta = f(beta). Iterating f (a sweep) converges slowly, so this is Newton's method for t = log beta,
     after one sweep from START. Where a Newton step is too long the sweep itself is taken. The last step is taken
@@ -35,7 +35,7 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
 
     Args:
         sweep: returns log f(beta) and its derivatives by log beta, from log beta and `parts`.
-        given: scalars that are fixed, NaN for those that are to be found (1,) or (2,).
+        given: the scalars (1,) or (2,) where they are fixed, which are then the result; NaN where they are to be found.
         parts: matrices of the bound, the other arguments of `sweep`.
     """
     # No derivatives inside the loop.
@@ -45,7 +45,8 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         """Return whether a free scalar still moves, and sweeps are left."""
         t, previous, sweeps = carry
-        return (sweeps < SWEEPS) & jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)))
+        smallest_move = rounding(CONVERGED, t, LOOP)
+        return (sweeps < SWEEPS) & jnp.any(free & (jnp.abs(t - previous) > smallest_move))
 
     def iterate(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the next t = log beta, the one before it, and the number of sweeps."""
@@ -53,10 +54,10 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
         refined, slopes = sweep(t, *fixed)
         return jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes)), t, sweeps + 1
 
-    # Newton's method on the logarithms, until they stay.
+    # Newton's method on the logarithms, until they stay; where scalars are given it does not begin (|t - t| = 0).
     first = jnp.log(jnp.where(free, START, given))
     t, _, _ = jax.lax.while_loop(goes_on, iterate, (first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)))
-    # One Newton step with derivatives: dt = (I - J)^-1 df.
+    # One Newton step with derivatives, dt = (I - J)^-1 df; given scalars are returned whatever it says.
     refined, slopes = sweep(t, *parts)
     return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
 

@@ -1,4 +1,4 @@
-"""Best linear filter behind a random channel with independent draws, and the choice among the others."""
+"""Best linear filter behind a random channel with independent draws, and the choice of the filter for others."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,18 +14,18 @@ import heliograph.filters.modes as modes
 import heliograph.filters.words as words
 import heliograph.filters.wrappers as wrappers
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel_moments
-from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
-from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
-from heliograph.filters.linear.given_record import LinearFilterOfRecord
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import Signal, bound_signal_power_at_start
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
+from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
 from heliograph.filters.linear.likelihood_scores import ScoreRecursion
-from heliograph.filters.linear.plan import plan_filter
+from heliograph.filters.linear.linear_filter_state import LinearBelief, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
@@ -156,7 +156,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
         slopes=slopes,
         noise=noise.columns,
         second=symmetric(second),
-        size=signal_size_at_start(sensor, start),
+        size=bound_signal_power_at_start(sensor, start),
     )
 
 

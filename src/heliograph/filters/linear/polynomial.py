@@ -1,4 +1,4 @@
-"""Filters of powers and products of the measurement: a lift of z before a linear filter."""
+"""Polynomial filters: a linear filter of the monomials of the measurement, or of its products with an estimate."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
-from heliograph.filters.linear.mean_before_data import UnconditionalMean, centre_plant, mean_before_data
-from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
-from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.linear.scheduled_gains import LinearSystemFilter, ScheduledFilter, ScheduleState
+from heliograph.filters.linear.unconditional_mean import UnconditionalMean, centre_plant, find_unconditional_mean
+from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.monomial_lifted_system import lifted_system
@@ -126,7 +126,7 @@ class PolynomialFilter(AbstractSizedFilter):
 
 
 def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
-    """Return the mean of the state at the start (n,), zeros where nothing is subtracted."""
+    """Return E[x_0] (n,) of the unconditional mean `centre` that the filter subtracts; zeros where there is none."""
     start = np.zeros(n) if centre is None else centre.start
     mean: jax.Array = library(start).asarray(start)
     return mean
@@ -199,7 +199,7 @@ def _lift_about_mean(
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
     """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
     check_model(plant, sensor, channel)
-    centre = mean_before_data(plant, sensor, channel)
+    centre = find_unconditional_mean(plant, sensor, channel)
     centred_plant = plant if centre is None else centre_plant(plant)
     return centre, lifted_system(centred_plant, sensor, channel, degree, horizon)
 

@@ -1,19 +1,19 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .additive import AdditiveModalFilter as AdditiveModalFilter
-from .additive import additive_modal_filter as additive_modal_filter
-from .additive import independent_terms as independent_terms
-from .arrival_patterns import SideInformation as SideInformation
+from .additive_links import AdditiveModalFilter as AdditiveModalFilter
+from .additive_links import additive_modal_filter as additive_modal_filter
+from .additive_links import independent_terms as independent_terms
+from .arrival_patterns import ChannelByPattern as ChannelByPattern
 from .arrival_patterns import append_flag as append_flag
 from .arrival_patterns import describe_by_pattern as describe_by_pattern
 from .arrival_patterns import pattern_of as pattern_of
-from .mixture import AtomCombinations as AtomCombinations
-from .mixture import MixtureFilter as MixtureFilter
-from .modal import ChannelByMode as ChannelByMode
-from .modal import ModalFilter as ModalFilter
-from .modal import channels_by_mode as channels_by_mode
-from .modal import claim_of_modes as claim_of_modes
-from .modal import modal_filter as modal_filter
+from .finite_support_filter import AtomCombinations as AtomCombinations
+from .finite_support_filter import MixtureFilter as MixtureFilter
+from .jump_linear_filter import ChannelByMode as ChannelByMode
+from .jump_linear_filter import ModalFilter as ModalFilter
+from .jump_linear_filter import channels_by_mode as channels_by_mode
+from .jump_linear_filter import claim_of_modes as claim_of_modes
+from .jump_linear_filter import modal_filter as modal_filter
 from .mode_observed import ModeObservedFilter as ModeObservedFilter
 from .models_by_mode import find_models as find_models
 from .multiple_model import ModalBeliefs as ModalBeliefs

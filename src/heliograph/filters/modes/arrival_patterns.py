@@ -17,7 +17,7 @@ from heliograph.random_affine.moments.moment_tensors import symmetric_product
 from heliograph.random_affine.moments.second_moments import join_gain_and_noise, split_off_noise
 
 
-class SideInformation(Module):
+class ChannelByPattern(Module):
     """A channel at one step, by mode and by pattern of arrivals.
 
     transition: of the modes from the step before to this one. For each pattern of components that arrive: `present`,
@@ -42,7 +42,7 @@ class SideInformation(Module):
         return join_gain_and_noise(self.gain_spread, self.noise)
 
 
-def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
+def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[ChannelByPattern]:
     """Return the channel at each step by mode and pattern of arrivals, the patterns being those of all steps.
 
     `flags`: P(flag | mode).
@@ -62,7 +62,7 @@ def _describe_step_by_pattern(
     patterns: list[tuple[bool, ...]],
     before: JointModes,
     flags: Float[np.ndarray, "M F"],
-) -> SideInformation:
+) -> ChannelByPattern:
     """Return the channel of one step by mode and pattern of arrivals.
 
     Args:
@@ -89,7 +89,7 @@ def _describe_step_by_pattern(
     spread = second - np.array([[symmetric_product(gain, gain) for gain in row] for row in mean])
     gains, noises = zip(*(split_off_noise(part) for row in spread for part in row), strict=True)
     noise = WeightedColumns(*(np.reshape(part, (*shape, *np.shape(part[0]))) for part in zip(*noises, strict=True)))
-    return SideInformation(
+    return ChannelByPattern(
         transition=before.transition,
         present=np.array(patterns).reshape(len(patterns), m),
         chance=chance,

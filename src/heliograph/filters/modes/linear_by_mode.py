@@ -1,4 +1,4 @@
-"""Linear plants and sensors of x~ = (x, 1) about a centre c, mode by mode: the parts of filters of jump systems.
+"""Transition, output and noise matrices of x~ = (x, 1) about a centre c, mode by mode, of filters of jump systems.
 
 All moments are those of (x - c, 1): a mean far from zero, which the modes' indicators multiply, would leave no digits
 for the rest.
@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.covariance_factors import WeightedColumns, rounding_of
-from heliograph.filters.gaussian.belief import process_noise
+from heliograph.factors.columns import WeightedColumns, rounding_of
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.types import ArrayLike
@@ -44,7 +44,7 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
 
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> WeightedColumns:
     """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator."""
-    w = process_noise(plant, jnp.asarray(u), start)
+    w = factor_process_noise(plant, jnp.asarray(u), start)
     of_indicator = rounding_of(np.ones(1))
     matrix = jax.scipy.linalg.block_diag(w.matrix, of_indicator.matrix)
     return WeightedColumns(matrix, jnp.append(w.weights, of_indicator.weights))

@@ -1,4 +1,4 @@
-"""When the Gaussians of modes are merged, and how: mixtures of them by two moments, and what a plant makes of these."""
+"""When and how the Gaussians of modes are merged (GPB1, IMM, GPB2), and the prediction of the mixtures."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -8,14 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.factored_gaussian import (
-    Gaussian,
-    from_covariance_by_elimination,
-    merge_mixture,
-    moments_of_mixture,
-)
-from heliograph.filters.gaussian.belief import predict_gaussian, process_noise
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.factors.gaussian import Gaussian, from_covariance_by_elimination, merge_mixture, moments_of_mixture
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, predict_gaussian
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.module import Module, unwritten
 
@@ -177,7 +172,7 @@ def mix_and_predict(
         return jax.vmap(lambda x: predict_gaussian(plant, transform, x, u, start))(mixtures)
     # A linear plant moves the parts before they are mixed, each once rather than once for each mixture: their means
     # A m + shift(u), the shift with the mean of w in it, and their covariances A P A'.
-    matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
     means = jax.vmap(lambda mean: matrix @ mean + plant.shift(u))(parts.mean)
     spreads = jax.vmap(lambda x: x.columns.through(matrix).covariance)(parts)
 
@@ -190,7 +185,7 @@ def mix_and_predict(
     return moved
 
 
-def move_by_law(
+def mix_and_predict_by_mode(
     plants: Sequence[AbstractPlant],
     plant_of: np.ndarray,
     transform: AbstractTransform,
@@ -253,7 +248,7 @@ def _predict_each(
     if not isinstance(plant, LinearPlant):
         before = jax.vmap(from_covariance_by_elimination)(*x)
         return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, start))(before)
-    matrix, noise = plant.transition_matrix(u), process_noise(plant, u, start).covariance
+    matrix, noise = plant.transition_matrix(u), factor_process_noise(plant, u, start).covariance
 
     def move(mean: jax.Array, covariance: jax.Array) -> Gaussian:
         """Move one pair of moments."""
@@ -261,3 +256,8 @@ def _predict_each(
 
     moved: Gaussian = jax.vmap(move)(*x)
     return moved
+
+
+def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
+    """Return means (components, n) with angles near those of the most probable component, so that they average."""
+    return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean

@@ -12,12 +12,18 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, PlantMotion, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.linear.linear import correct_linear
+from heliograph.filters.linear.linear_filter_state import (
+    LinearBelief,
+    PlantMotion,
+    motion_of_plant,
+    predict_belief,
+    prior_belief,
+)
 from heliograph.filters.modes.arrival_patterns import append_flag
-from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.modes.jump_linear_filter import claim_of_modes
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
@@ -110,7 +116,7 @@ class ModeObservedFilter(AbstractSizedFilter):
             prior = jax.tree.map(lambda a, b: jnp.where(is_known & state.begun, a, b), redone, state.belief)
             described = self._describe_channel_after(state.begun, states_or_zero, k)
         else:
-            prior, described = state.belief, _condition_channel(channel, states_or_zero)
+            prior, described = state.belief, _find_moments_given_states(channel, states_or_zero)
         # Update with z, which is not used where a state is missing.
         usable = jnp.where(is_known, z, jnp.nan)
         after, innovation = correct_linear(prior, sensor, described, Polytope(), z, second_moments_at_start(self.plant))
@@ -126,7 +132,7 @@ class ModeObservedFilter(AbstractSizedFilter):
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
         """Return the prior of step k after the last measurement is used again, given the memories' states then."""
         last = jnp.maximum(jnp.asarray(k) - 1, 0)
-        channel = _condition_channel(at(self.channel, last), memory_states)
+        channel = _find_moments_given_states(at(self.channel, last), memory_states)
         start = second_moments_at_start(self.plant)
         redone, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
         return predict_belief(redone, state.move)
@@ -137,8 +143,8 @@ class ModeObservedFilter(AbstractSizedFilter):
         `begun`: whether there was a step before.
         """
         channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
-        following = _predict_channel(at(self.channel, last), channel, memory_states)
-        of_first_step = _predict_channel(None, channel, memory_states)
+        following = _find_moments_given_earlier_states(at(self.channel, last), channel, memory_states)
+        of_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
         described: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), following, of_first_step)
         return described
 
@@ -148,13 +154,13 @@ class ModeObservedFilter(AbstractSizedFilter):
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
-def _condition_channel(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+def _find_moments_given_states(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
     """Return the second moments of the channel given the memories' states, as numbers."""
     states = [m.state_from_number(number) for m, number in zip(memories(channel).values(), numbers, strict=True)]
-    return _nominal_moments(condition_on_memories(channel, states))
+    return _find_nominal_moments(condition_on_memories(channel, states))
 
 
-def _predict_channel(
+def _find_moments_given_earlier_states(
     last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array
 ) -> SecondOrder:
     """Return the moments of the channel given the memories' states one step before; without them, of the first step."""
@@ -169,10 +175,10 @@ def _predict_channel(
     for combination in product(*choices):
         maps.append(condition_on_memories(channel, [state for state, _ in combination]))
         probabilities.append(jnp.asarray(prod(weight for _, weight in combination)))
-    return _nominal_moments(Mixture(maps, jnp.stack(probabilities)))
+    return _find_nominal_moments(Mixture(maps, jnp.stack(probabilities)))
 
 
-def _nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
+def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
     """Return the mean and spread of the channel under the nominal law, for numbers that may be traced."""
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))

@@ -24,9 +24,9 @@ from heliograph.factors.factored_gaussian import (
     rts_step,
     sum_unexplained,
 )
-from heliograph.filters.gaussian.belief import image_of, process_noise
-from heliograph.filters.gaussian.signal import condition_on_measurement
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement
 from heliograph.filters.modes.mixing import normalise_columns
 from heliograph.filters.smoother_step import EarlierState, SmootherStep
 from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
@@ -79,8 +79,8 @@ def move_pairs(
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
         """Move one Gaussian by one plant: f(x, u) by its slopes in x, and what these do not explain."""
-        image = image_of(plant, transform, x, u)
-        rest = sum_unexplained(image, process_noise(plant, u, start))
+        image = find_transition_moments(plant, transform, x, u)
+        rest = sum_unexplained(image, factor_process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
         predicted = from_columns(mean, join_columns(image.explained, rest))
         return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, rest))

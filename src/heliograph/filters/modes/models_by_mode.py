@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from heliograph.filters.base import make_sizes
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, models_of
 from heliograph.model.over_time import OverTime, first, restack, unstack
@@ -18,9 +18,9 @@ from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.random_affine.modes import JointModes, joint_modes
 
 
-def describe_modes(
+def describe_joint_modes(
     plant: AbstractPlant, sensor: AbstractSensor, channel: Channel, nodes: int
-) -> tuple[JointModes, SideInformation | OverTime]:
+) -> tuple[JointModes, ChannelByPattern | OverTime]:
     """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step."""
     steps = [joint_modes(c, nodes, beside=(plant, sensor)) for c in unstack(channel)]
     modes = len(steps[0].initial)
@@ -32,7 +32,7 @@ def describe_modes(
     return steps[0], restack(parts, channel)
 
 
-def _check_density(channel: SideInformation) -> None:
+def _check_density(channel: ChannelByPattern) -> None:
     """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one."""
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
@@ -59,7 +59,7 @@ def fields_of_mode_filters(
     for model in models_of(first(sensor)):
         check_link(model, first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
-    joint, described = describe_modes(first(plant), first(sensor), channel, nodes)
+    joint, described = describe_joint_modes(first(plant), first(sensor), channel, nodes)
     return {
         "plant": drop_names(plant), "sensor": drop_names(sensor),
         "channel": described, "initial": joint.initial, "observed_angles": angles,

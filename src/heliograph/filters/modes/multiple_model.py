@@ -29,33 +29,39 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import (
+from heliograph.filters.gaussian.gaussian_prediction import (
     second_moments_at_start,
     smoother_step_by_transform,
 )
-from heliograph.filters.gaussian.signal import Signal, condition_on_measurement, noise_behind_gain, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import (
+    Signal,
+    condition_on_measurement,
+    find_signal_moments,
+    noise_behind_gain,
+)
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
-from heliograph.filters.modes.arrival_patterns import SideInformation, pattern_of
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, pattern_of
 from heliograph.filters.modes.mixing import (
     AbstractMerging,
     MergeAll,
     MergeByMode,
     MergeByNextMode,
     MergePairs,
-    move_by_law,
+    align_angles,
+    mix_and_predict_by_mode,
 )
 from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
@@ -66,7 +72,7 @@ T = TypeVar("T", bound=PyTree)
 
 def correct_in_every_mode(
     signal: Signal,
-    channel: SideInformation,
+    channel: ChannelByPattern,
     mode: jax.Array,
     weight: jax.Array,
     z: jax.Array,
@@ -136,7 +142,7 @@ class ModalBeliefs(NamedTuple):
 NODES = 3  # modes that stand for a gain that drifts
 
 
-class _DescribedPairs(NamedTuple):
+class _PairSmootherTerms(NamedTuple):
     """What a smoother by pairs (mode i before, mode j after) needs of a step of M modes.
 
     `known`: the Gaussian of each mode j that the smoothed one is compared with, predicted, or filtered where pairs take
@@ -158,7 +164,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     initial: Float[Array, " M"]
     merging: AbstractMerging
     transform: AbstractTransform
@@ -183,7 +189,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plants, u, modes = models_of(at(self.plant, k)), jnp.asarray(u), len(self.initial)
         mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, u, k))
-        parts = move_by_law(
+        parts = mix_and_predict_by_mode(
             plants=plants,
             plant_of=np.array(self.plant_modes),
             transform=self.transform,
@@ -226,7 +232,8 @@ class MultipleModelFilter(AbstractSizedFilter):
             of_pairs = component[sensor_of_pair == number]
             once = np.unique(of_pairs)
             priors = parts if len(once) == len(parts.mean) else jax.tree.map(lambda leaf, i=once: leaf[i], parts)
-            signals = jax.vmap(lambda x, sensor=sensor: signal_of(plant, sensor, self.transform, x, start))(priors)
+            measure = partial(find_signal_moments, plant, sensor, self.transform)
+            signals = jax.vmap(lambda x, measure=measure: measure(x, start))(priors)
             index = np.searchsorted(once, of_pairs)
             results.append(jax.tree.map(lambda leaf, index=index: leaf[index], signals))
         if len(results) == 1:
@@ -264,7 +271,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Return the law of a state after a correction, mode by mode."""
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
-    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> _DescribedPairs:
+    def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> _PairSmootherTerms:
         """Return what a smoother by pairs of modes needs of a step; `after`: the law by mode after its correction."""
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
@@ -276,13 +283,13 @@ class MultipleModelFilter(AbstractSizedFilter):
         known = after.gaussian if self.merging.corrects_pairs else step.prior.gaussian
         pairs = pairs._replace(mean=plants[0].near(pairs.mean, jnp.tile(known.mean, (modes, 1))))
         if not self.merging.corrects_pairs:
-            return _DescribedPairs(known=known, pairs=pairs, weights=weights, ways=moved.back)
+            return _PairSmootherTerms(known=known, pairs=pairs, weights=weights, ways=moved.back)
         j = np.tile(np.arange(modes), modes)
         signal = self.signals_of_pairs(pairs, (np.arange(modes**2), j), k)
         pairs, weight, _ = correct_in_every_mode(
             signal, at(self.channel, k), jnp.asarray(j), weights.reshape(-1), jnp.asarray(step.z), self.observed_angles
         )
-        return _DescribedPairs(known=known, pairs=pairs, weights=weight.reshape(modes, modes), ways=moved.back)
+        return _PairSmootherTerms(known=known, pairs=pairs, weights=weight.reshape(modes, modes), ways=moved.back)
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
@@ -295,11 +302,6 @@ def replicate(x: T, count: int) -> T:
     """Replicate an object `count` times along a new first axis."""
     copies: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
     return copies
-
-
-def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return means (components, n) with angles near those of the most probable component, so that they average."""
-    return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
 @accept_limits

@@ -19,18 +19,18 @@ from heliograph.filters.base import (
     estimates,
     predicts,
 )
-from heliograph.filters.gaussian.belief import predict_gaussian, second_moments_at_start
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform
-from heliograph.filters.modes.arrival_patterns import SideInformation
+from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform
+from heliograph.filters.gaussian.signal_moments import find_signal_moments
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.mixing import align_angles
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.modes.multiple_model import (
-    align_angles,
     correct_in_every_mode,
     replicate,
 )
 from heliograph.filters.particles.factory import build_partly_drawn
-from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
+from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
     effective_number,
     fold_in_bits,
@@ -82,7 +82,7 @@ class ParticleFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     initial: Float[Array, " M"]
     transform: AbstractTransform
     observed_angles: Angles = eqx.field(static=True)
@@ -127,7 +127,7 @@ class ParticleFilter(AbstractSizedFilter):
         """Correct each particle with z, weight it by its likelihood, and resample below half the effective number."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         start = second_moments_at_start(self.plant)
-        signals = jax.vmap(lambda x: signal_of(plant, sensor, self.transform, x, start))(state.gaussian)
+        signals = jax.vmap(lambda x: find_signal_moments(plant, sensor, self.transform, x, start))(state.gaussian)
         after, weight, mixed = correct_in_every_mode(
             signals, channel, state.mode, state.weight, z, self.observed_angles
         )

@@ -23,18 +23,18 @@ from heliograph.factors.covariance_factors import (
 )
 from heliograph.factors.factored_gaussian import Innovations, from_covariance
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.signal import factor_spread, signal_size_at_start
-from heliograph.filters.modes.arrival_patterns import SideInformation, append_flag, describe_by_pattern, pattern_of
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import bound_signal_power_at_start, factor_spread
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag, describe_by_pattern, pattern_of
 from heliograph.filters.modes.gram_schmidt import orthogonalise_first_rows
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
-from heliograph.filters.modes.modal import (
+from heliograph.filters.modes.jump_linear_filter import (
     concatenate_modes,
     kron,
+    make_mode_sum_matrix,
     predict_by_mode,
     subtract_mean_output,
-    sum_of_modes,
 )
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
@@ -101,7 +101,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: SideInformation | OverTime
+    channel: ChannelByPattern | OverTime
     initial: Float[Array, " M"]
     flagged: bool = eqx.field(static=True)
 
@@ -181,8 +181,8 @@ class SideInformationFilter(AbstractSizedFilter):
         links = jax.tree.map(
             lambda part: jnp.asarray(part)[:, pattern], (channel.mean, channel.gain_spread, channel.noise)
         )
-        size = signal_size_at_start(sensor, second_moments_at_start(self.plant))
-        received = _describe_received(prior, sensor, size, *links)
+        size = bound_signal_power_at_start(sensor, second_moments_at_start(self.plant))
+        received = _make_measurement_model(prior, sensor, size, *links)
         # What z says of zeta, then the innovation as it is reported: NaN for what did not arrive.
         after, innovations, innovation = _project_on_data(prior, excess, received, z)
         likelihood = innovations.log_density(arrived, jnp.abs(z) + jnp.abs(innovation.mean))
@@ -196,12 +196,12 @@ class SideInformationFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
         """Return x = c + sum_j zeta^j, and the covariance of its error."""
-        projection = sum_of_modes(len(self.states), len(self.initial))
+        projection = make_mode_sum_matrix(len(self.states), len(self.initial))
         mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
         return Estimate(mean, covariance, self.claim)
 
 
-class ReceivedModel(NamedTuple):
+class StackedMeasurementModel(NamedTuple):
     """Model of what arrives: z = common + output zeta + noise, its noise in each mode times the mode's probability.
 
     Shapes: output (m, N), common (m,), noise (M, m, m) columns.
@@ -240,14 +240,14 @@ def _mode_probabilities(x: jax.Array, weights: jax.Array) -> jax.Array:
     return jnp.einsum("jq,jq->j", x[:, -1] ** 2, weights)
 
 
-def _describe_received(
+def _make_measurement_model(
     state: SideInformationBelief,
     sensor: LinearSensor,
     size: jax.Array,
     gains: jax.Array,
     gain_spread: jax.Array,
     link: WeightedColumns,
-) -> ReceivedModel:
+) -> StackedMeasurementModel:
     """Return what is received of zeta = x~ 1{mode}: the output matrix, the mean output, and the noise in each mode.
 
     In mode j, z = H y~ + n with y~ = (y, 1) = C~ x~ + v~: the noise has the covariance T_j(E[y~ y~' 1{j}]) +
@@ -278,11 +278,11 @@ def _describe_received(
     output, common = subtract_mean_output(gains @ measure, law)
     output = concatenate_modes(jnp.where(law[:, None, None] > 0, output, 0.0))
     noises = jax.vmap(describe_noise)(gains, gain_spread, link, WeightedColumns(x, weights), law)
-    return ReceivedModel(output=output, common=common, noise=noises)
+    return StackedMeasurementModel(output=output, common=common, noise=noises)
 
 
 def _project_on_data(
-    state: SideInformationBelief, excess: jax.Array, received: ReceivedModel, z: jax.Array
+    state: SideInformationBelief, excess: jax.Array, received: StackedMeasurementModel, z: jax.Array
 ) -> tuple[SideInformationBelief, Innovations, PredictedInnovation]:
     """Project zeta on (1, s, z): what these say of the error e = zeta - s goes from e to the estimate s.
 
@@ -385,7 +385,7 @@ def side_information_filter(
 
 
 @cache_by_object
-def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[SideInformation], bool]:
+def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[ChannelByPattern], bool]:
     """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
     steps = [joint_modes(c) for c in unstack(channel)]
     is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)

@@ -14,22 +14,22 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns, join_columns, triangularise
 from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.filters.base import Step, corrects, predicts
-from heliograph.filters.gaussian.signal import factor_spread
-from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
-from heliograph.filters.modes.modal import (
+from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.modes.jump_linear_filter import (
     AbstractJointModalFilter,
     MeasurementModel,
     claim_of_modes,
     compute_initial_moments,
     concatenate_modes,
+    condition_modes_on_received,
+    factor_with_last_mode,
     fields_of_joint_modes,
     mean_from_centre,
-    observe_modes,
     predict_by_mode,
     rounding_of_received,
-    separate_modes,
     subtract_mean_output,
 )
+from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
@@ -111,7 +111,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         of_both = of_jumps + jnp.where(young > 0, 1 + 1 / jnp.where(young > 0, young, 1.0), 0.0) * of_chain
         # Columns of (1 + 1 / b) D and of the bound W on the covariance of the noise.
         low, high = _bound_next_law(rows, radius, state.low, state.high)
-        by_modes = separate_modes(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
+        by_modes = factor_with_last_mode(jnp.einsum("jl,ab->jalb", of_both[:-1, :-1], carried))
         of_process = self.process_noise_by_mode(u, k, factor_spread(_bound_diagonal(low, high)))
         return root, young, join_columns(by_modes, of_process)
 
@@ -127,7 +127,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
         rounding = rounding_of_received(gains, state.law[:, None, None] * second)
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         output = MeasurementModel(concatenate_modes(matrix), common, join_columns(rounding, factor_spread(added)))
-        after, innovation = observe_modes(state.gaussian, centred, output, z)
+        after, innovation = condition_modes_on_received(state.gaussian, centred, output, z)
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

@@ -1,7 +1,7 @@
 """Names that other folders take; the package loads them when first used."""
 
 from .factory import build_partly_drawn as build_partly_drawn
-from .partly_drawn import PartlyDrawnFilter as PartlyDrawnFilter
+from .rao_blackwellised import PartlyDrawnFilter as PartlyDrawnFilter
 from .resampling import effective_number as effective_number
 from .resampling import fold_in_bits as fold_in_bits
 from .resampling import invert_distribution as invert_distribution

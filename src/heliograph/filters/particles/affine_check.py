@@ -21,7 +21,7 @@ MOVES = ("reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concat
 LOOKUPS = ("gather", "dynamic_slice")  # the first operand is moved, by indices
 
 
-class _TracedArray(NamedTuple):
+class _EntryDegrees(NamedTuple):
     """Degrees of an array's entries, and its value where all of them are known."""
 
     degree: np.ndarray
@@ -46,18 +46,18 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequenc
     program = jax.make_jaxpr(function)(x, *rest)
     degree = np.full(x.shape, GIVEN)
     degree[list(places)] = AFFINE
-    arguments = [_TracedArray(degree), *(_TracedArray(np.full(np.shape(argument), GIVEN)) for argument in rest)]
+    arguments = [_EntryDegrees(degree), *(_EntryDegrees(np.full(np.shape(argument), GIVEN)) for argument in rest)]
     return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, arguments))
 
 
-def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_TracedArray]) -> list[_TracedArray]:
+def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of a program's results, operation by operation."""
     values = dict(zip(program.jaxpr.invars, arguments, strict=True))
-    values.update(zip(program.jaxpr.constvars, map(_constant, program.consts), strict=True))
+    values.update(zip(program.jaxpr.constvars, map(_trace_known_array, program.consts), strict=True))
 
-    def read(atom: Any) -> _TracedArray:
+    def read(atom: Any) -> _EntryDegrees:
         """Return the degrees of an operand: a literal number, or a result of an earlier operation."""
-        return _constant(atom.val) if isinstance(atom, core.Literal) else values[atom]
+        return _trace_known_array(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     for equation in program.jaxpr.eqns:
         inputs = [read(atom) for atom in equation.invars]
@@ -65,12 +65,12 @@ def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_TracedArray])
     return [read(atom) for atom in program.jaxpr.outvars]
 
 
-def _constant(value: Any) -> _TracedArray:
+def _trace_known_array(value: Any) -> _EntryDegrees:
     """Return the degrees of a known array."""
-    return _TracedArray(np.full(np.asarray(value).shape, KNOWN), value)
+    return _EntryDegrees(np.full(np.asarray(value).shape, KNOWN), value)
 
 
-def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedArray]:
+def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of the results of one traced operation (a JAX equation), from the degrees of its operands x.
 
     KNOWN: a constant, with its value; GIVEN: made of arguments that are given; AFFINE: in the others; OTHER: any.
@@ -86,20 +86,20 @@ def _degrees_of_operation(equation: Any, x: list[_TracedArray]) -> list[_TracedA
         return _trace_degrees(called, x)
     # Known operands give known results, given ones given results.
     if all(operand.value is not None for operand in x):
-        return [_constant(value) for value in compute([operand.value for operand in x])]
+        return [_trace_known_array(value) for value in compute([operand.value for operand in x])]
     shapes = [out.aval.shape for out in equation.outvars]
     if all(np.all(operand.degree <= GIVEN) for operand in x):
-        return [_TracedArray(np.full(shape, GIVEN)) for shape in shapes]
+        return [_EntryDegrees(np.full(shape, GIVEN)) for shape in shapes]
     # Operations that move numbers move their degrees alike.
     if name in MOVES:
-        return [_TracedArray(np.asarray(degree)) for degree in compute([operand.degree for operand in x])]
+        return [_EntryDegrees(np.asarray(degree)) for degree in compute([operand.degree for operand in x])]
     if name in LOOKUPS and all(index.value is not None for index in x[1:]):
         moved = compute([x[0].degree, *(index.value for index in x[1:])])
-        return [_TracedArray(np.asarray(degree)) for degree in moved]
-    return [_TracedArray(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
+        return [_EntryDegrees(np.asarray(degree)) for degree in moved]
+    return [_EntryDegrees(np.broadcast_to(_degree_of_arithmetic(name, params, x), shape)) for shape in shapes]
 
 
-def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArray]) -> Any:
+def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_EntryDegrees]) -> Any:
     """Return the degrees, entry by entry, of the result of an operation on operands x; OTHER if it is not listed here.
 
     A degree is a number, KNOWN (a constant) < GIVEN (no function of the variables) < AFFINE in them < OTHER, so that a
@@ -116,7 +116,7 @@ def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArra
             return np.max(x[0].degree, axis=tuple(params["axes"]), initial=KNOWN)
         case "mul":  # of numbers of which one is given; a known zero makes the product zero
             zero = x[0].is_zero | x[1].is_zero
-            return np.where(zero, GIVEN, _of_product(x[0].degree, x[1].degree))
+            return np.where(zero, GIVEN, _degree_of_product(x[0].degree, x[1].degree))
         case "div":
             return np.where(x[1].degree <= GIVEN, x[0].degree, OTHER)
         case "integer_pow" if params["y"] == 1:
@@ -129,12 +129,12 @@ def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_TracedArra
     return np.asarray(OTHER)
 
 
-def _of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _degree_of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the degrees of products of numbers of degrees a and b."""
     return np.where(np.minimum(a, b) <= GIVEN, np.maximum(a, b), OTHER)
 
 
-def _degree_of_contraction(a: _TracedArray, b: _TracedArray, dimensions: Any) -> np.ndarray:
+def _degree_of_contraction(a: _EntryDegrees, b: _EntryDegrees, dimensions: Any) -> np.ndarray:
     """Return the degrees of the sums of products that a contraction (dot_general) of a and b makes.
 
     A product with a known zero is none. A sum is AFFINE where some product has one AFFINE factor, and OTHER where a

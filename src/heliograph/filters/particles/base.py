@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractSizedFilter, FilterAngles, Step
 from heliograph.filters.chunks import ScanResult
-from heliograph.filters.particles.expected_measurement import find_reference
-from heliograph.filters.particles.lanes import filter_particles
+from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.moments import StateSums
+from heliograph.filters.particles.native_particle_loop import filter_particles
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
 from heliograph.model.estimate import Estimate, Innovation
@@ -74,23 +74,23 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         return filter_particles(self, z, u, state, begin) if self.particles >= ENOUGH else None
 
     @abstractmethod
-    def make_room(self, count: int) -> Any:
+    def allocate_particles(self, count: int) -> Any:
         """Return arrays of so many particles, a tree of what each is, to be filled."""
 
     @abstractmethod
-    def particles_of(self, state: Any) -> Any:
+    def get_particles(self, state: Any) -> Any:
         """Return what the particles (N, ...) of a state are."""
 
     @abstractmethod
-    def sum_states(self, weight: jax.Array, particles: Any) -> StateSums:
+    def sum_for_mean(self, weight: jax.Array, particles: Any) -> StateSums:
         """Return the first sums of particles (B,) by weights of any sum."""
 
     @abstractmethod
-    def sum_apart(self, weight: jax.Array, particles: Any, sums: StateSums) -> jax.Array:
+    def sum_for_covariance(self, weight: jax.Array, particles: Any, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of particles (B,) about the mean that first sums of all have."""
 
     @abstractmethod
-    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+    def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return the estimate that both sums over all particles say."""
 
     @abstractmethod
@@ -100,23 +100,25 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """Return sums of what particles (B,) expect of z, counted from what one of reference expects."""
 
     @abstractmethod
-    def innovation_of(self, received: Any, reference: tuple[Any, ...], z: Any, k: Step, density: Any) -> Innovation:
+    def innovation_from_sums(
+        self, received: Any, reference: tuple[Any, ...], z: Any, k: Step, density: Any
+    ) -> Innovation:
         """Return the innovation that these sums over all particles say; `density`: log p(z)."""
 
     def compute_estimate(self, state: Any) -> Estimate:
         """Return the mean and covariance of all particles, by sums over them."""
-        weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.particles_of(state)))
-        sums = self.sum_states(weight, particles)
-        return self.estimate_of(sums, self.sum_apart(weight, particles, sums))
+        weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.get_particles(state)))
+        sums = self.sum_for_mean(weight, particles)
+        return self.estimate_from_sums(sums, self.sum_for_covariance(weight, particles, sums))
 
     def compute_innovation(
         self, weight: jax.Array, predicted: tuple[jax.Array, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
         """Return z less its mean, its covariance and the log-likelihood, by sums over what particles (N,) expect."""
-        number = find_reference(weight, predicted)
+        number = find_reference_particle(weight, predicted)
         reference = tuple(part[number] for part in predicted)
         received = self.sum_received(reference, weight, predicted, z, k)
-        return self.innovation_of(received, reference, z, k, density)
+        return self.innovation_from_sums(received, reference, z, k, density)
 
     @property
     def of_atoms(self) -> bool:
@@ -132,7 +134,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         return ResampledParticles(which, jnp.where(too_few, 0.0, log_weight))
 
 
-def keep_unused(used: jax.Array, updated: State, before: State) -> State:
+def update_if_used(used: jax.Array, updated: State, before: State) -> State:
     """Return the updated state where the row is used, else the state before."""
     kept: State = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, before)
     return kept

@@ -1,4 +1,4 @@
-"""What particles expect of a measurement: the moments of its innovation over those where h(x) is a number."""
+"""Mean and covariance of the innovation, from what each particle expects of a measurement, where h(x) is a number."""
 
 import functools
 from typing import NamedTuple
@@ -60,7 +60,7 @@ class ExpectedMeasurement(NamedTuple):
         return Innovation(self.base + mean, within + spread, jnp.where(nothing, 0.0, density))
 
 
-def find_reference(weight: Array, predicted: tuple[Array, ...]) -> Array:
+def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
     """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any."""
     xp = library(weight, predicted)
     finite = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]

@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.filters.base import make_sizes
 from heliograph.filters.modes.models_by_mode import find_models
 from heliograph.filters.particles.affine_check import is_affine
-from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
+from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.received_density import find_received_density
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.modes_of_motion import models_of

@@ -1,4 +1,4 @@
-"""Where particles are drawn with a measurement: from the law of the noise given it, a tenth from the prior.
+"""Draw particles with the measurement: by the law of the noise given it, a tenth by the prior; and weigh them.
 
 Notation: x+ = m + G e, e ~ N(0, I), and z = M (h(m) + H G e) + c + r, r ~ N(0, R), to first order: m the `center`, G
 the `root` of the process noise, H the sensor's slopes, M the link's mean gain. G may be singular, R is regular.
@@ -101,6 +101,6 @@ def propose_particles(
     return ProposedParticles(*jax.vmap(propose_one)(moved.center, moved.draws, from_prior))
 
 
-def noise_columns(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
+def factor_noise_covariance(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
     """Return the factors of Cov w (n, n) of a plant under the input u."""
     return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

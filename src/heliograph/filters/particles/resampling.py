@@ -44,7 +44,7 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
         least = np.nextafter(-1.0, 0.0)
         uniform = jnp.maximum(least, 2 * draw_uniforms(key, numbers, size, particles) + least)
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
-    words = draw_words(key, numbers, -(-size // 2), particles)
+    words = draw_random_bits(key, numbers, -(-size // 2), particles)
     halves = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
     # The middles of 2^23 parts of (-1, 1).
     uniform = (halves >> 9).astype(jnp.int32).astype(jnp.float32) * np.float32(STEP) + np.float32(STEP / 2 - 1)
@@ -53,14 +53,16 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
 
 def draw_uniforms(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
     """Draw numbers of [0, 1), (B, size), for particles: those of `jax.random.uniform(key, (particles, size))`."""
-    mantissa = draw_words(key, numbers, size, particles) >> np.uint64(12)
+    # 52 random bits as the mantissa of a number of [1, 2), less 1.
+    mantissa = draw_random_bits(key, numbers, size, particles) >> np.uint64(12)
     return jax.lax.bitcast_convert_type(mantissa | np.float64(1.0).view(np.uint64), jnp.float64) - 1.0
 
 
-def draw_words(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
+def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
     """Draw `size` words of 64 bits, (B, size), for each of the particles of these numbers (B,), or for all."""
     if numbers is None:
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
+    # The place of each word among those of all particles, which is folded into the key: two halves of 32 bits.
     places = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
     halves = jax.vmap(jax.vmap(lambda place: jax.random.fold_in(key, place)))(places).astype(jnp.uint64)
     return halves[..., 0] << np.uint64(32) | halves[..., 1]

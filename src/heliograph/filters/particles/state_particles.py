@@ -12,12 +12,12 @@ from heliograph.filters.base import Step, corrects, estimates, make_sizes, predi
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,
     WeighedParticles,
-    keep_unused,
     relative_to_largest,
+    update_if_used,
 )
 from heliograph.filters.particles.expected_measurement import ExpectedMeasurement
 from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
-from heliograph.filters.particles.proposal import MoveLaw, noise_columns, propose_particles
+from heliograph.filters.particles.proposal import MoveLaw, factor_noise_covariance, propose_particles
 from heliograph.filters.particles.received_density import ReceivedAtoms, find_received_density
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.channel import Channel, check_link, find_received_angles
@@ -70,13 +70,13 @@ class StateParticleFilter(AbstractStateParticleFilter):
     What is done with particles takes any of them side by side, by their numbers: all at once (None), or a lane each.
     """
 
-    always_used = False
+    uses_empty_rows = False
 
-    def make_room(self, count: int) -> np.ndarray:
+    def allocate_particles(self, count: int) -> np.ndarray:
         """Return an array of so many positions."""
         return np.zeros((count, len(self.states)))
 
-    def particles_of(self, state: StateParticles) -> jax.Array:
+    def get_particles(self, state: StateParticles) -> jax.Array:
         """Return the positions (N, n) of a state."""
         return state.position
 
@@ -85,9 +85,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Draw the particles from the law of x_0."""
         key, own = self.start_keys()
         x = self.draw_start(own, jnp.arange(self.particles))
-        return self.state_of(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+        return self.make_state(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
-    def state_of(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
+    def make_state(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
         """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
         size = position.shape[1]
         law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
@@ -127,7 +127,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
             noise = jax.vmap(lambda number: plant.sample_noise(jax.random.fold_in(key, number), u))(every)
             return wrap_angles(center + noise, plant.angles), None
         draws = draw_normals(key, numbers, x.shape[1], self.particles)
-        center, root = center + plant.noise_mean(), _root_of(noise_columns(plant, u))
+        center, root = center + plant.noise_mean(), _find_square_root(factor_noise_covariance(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
         return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u) if self.optimal else None
 
@@ -142,7 +142,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         start_moved = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
         center = jnp.where(moved, law.center, mean)
-        root = jnp.where(moved, law.root, _root_of(join_columns(start_moved, noise_columns(plant, u))))
+        root = jnp.where(
+            moved, law.root, _find_square_root(join_columns(start_moved, factor_noise_covariance(plant, u)))
+        )
         return law._replace(center=center, root=root)
 
     @corrects
@@ -154,8 +156,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
         density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
-        updated = self.state_of(weighed.particles, log_weight, key)._replace(moved=state.moved)
-        after = keep_unused(used, updated, state._replace(key=key))
+        updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
+        after = update_if_used(used, updated, state._replace(key=key))
         return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -170,7 +172,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         They expected h(x) before z was known (B, p).
         """
-        sensor, atoms = at(self.sensor, k), self.atoms_of(z, k)
+        sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
         predicted = received = jax.vmap(sensor.measure)(position)
         correction = jnp.zeros(len(position))
         if law is not None:
@@ -180,7 +182,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
         return WeighedParticles(position, likelihood, (predicted,))
 
-    def atoms_of(self, z: jax.Array, k: Step) -> ReceivedAtoms:
+    def find_received_atoms(self, z: jax.Array, k: Step) -> ReceivedAtoms:
         """Return the atoms of what is received given h(x)."""
         atoms: ReceivedAtoms = jax.tree.map(lambda leaf: leaf[0], at(self.density, k).given_arrivals(z)[0])
         return atoms
@@ -189,11 +191,11 @@ class StateParticleFilter(AbstractStateParticleFilter):
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
         """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
-        expected = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles)
+        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         both, apart = expected.find_innovations(weight, *predicted)
         return first_sums(both, apart, ()), second_sums(both, apart)
 
-    def innovation_of(
+    def innovation_from_sums(
         self,
         received: tuple[FirstSums, jax.Array],
         reference: tuple[Any, ...],
@@ -203,19 +205,19 @@ class StateParticleFilter(AbstractStateParticleFilter):
     ) -> Innovation:
         """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
         first, second = received
-        expected = ExpectedMeasurement(self.atoms_of(z, k), z, reference[0], self.observed_angles)
+        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         return expected.compute_innovation(first, second, density)
 
-    def sum_states(self, weight: jax.Array, position: jax.Array) -> StateSums:
+    def sum_for_mean(self, weight: jax.Array, position: jax.Array) -> StateSums:
         """Return the first sums of positions (B, n)."""
         return StateSums(first_sums(weight, position, first(self.plant).angles), None)
 
-    def sum_apart(self, weight: jax.Array, position: jax.Array, sums: StateSums) -> jax.Array:
+    def sum_for_covariance(self, weight: jax.Array, position: jax.Array, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of positions (B, n) about the mean of all."""
         angles = first(self.plant).angles
         return second_sums(weight, wrap_angles(position - sums.first.mean(angles), angles))
 
-    def estimate_of(self, sums: StateSums, second: jax.Array) -> Estimate:
+    def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
         return Estimate(sums.first.mean(first(self.plant).angles), second / sums.first.weight, self.claim)
 
@@ -225,7 +227,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return self.compute_estimate(state)
 
 
-def _root_of(columns: WeightedColumns) -> jax.Array:
+def _find_square_root(columns: WeightedColumns) -> jax.Array:
     """Return a square root (n, n) of a covariance given by its columns."""
     triangular = triangularise(columns)
     return jnp.asarray(triangular.matrix * square_root(triangular.weights))

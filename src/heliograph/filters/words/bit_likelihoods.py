@@ -54,7 +54,7 @@ class LinkOfBits(Module):
         return [infer_sent_bits(link, received) for link in self.links]
 
 
-def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
+def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     """Return a channel of words as its possible laws, each with known error rates, and their probabilities.
 
     Raises:
@@ -64,7 +64,7 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
         expected = "a link that is not late (linear_filter takes delays)"
         raise fail("channel of a word filter", expected, f"one late by up to {channel.past} steps")
     if not channel.remembers:
-        fixed = _fix_rates(channel)  # pairs (probability, link of these error rates)
+        fixed = _list_known_rates(channel)  # pairs (probability, link of these error rates)
         weights = np.array([[share for share, _ in fixed]], dtype=float)
         return LinkOfBits(links=tuple(link for _, link in fixed), weights=weights, flag=None)
     # The link as it is in each mode, of which the number comes with the words (a told mode).
@@ -73,7 +73,7 @@ def describe_link(channel: AbstractRandomAffine) -> LinkOfBits:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
     # All links of known error rates, mode after mode. In each mode only its own have a probability above 0.
-    combinations = [_fix_rates(in_mode) for in_mode in link_by_mode]
+    combinations = [_list_known_rates(in_mode) for in_mode in link_by_mode]
     links = [link for of_mode in combinations for _, link in of_mode]
     weights = np.zeros((len(link_by_mode), len(links)))
     start = 0
@@ -93,7 +93,7 @@ def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]
     if not is_told or parts[-1] is not flags[0] or len(parts) < 2:
         return []
     modes = next(iter(chains.values())).modes
-    return [Stack([_choose_mode(part, mode) for part in parts[:-1]]) for mode in range(modes)]
+    return [Stack([_fix_mode(part, mode) for part in parts[:-1]]) for mode in range(modes)]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
@@ -102,22 +102,22 @@ def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
     return [link, *inside] if isinstance(link, Modes) else inside
 
 
-def _choose_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
+def _fix_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
     """Return a map in one mode of its chain."""
     if isinstance(link, Modes):
         return link.given(mode)
-    return replace_inner_maps(link, [_choose_mode(inner, mode) for inner in inner_maps(link)])
+    return replace_inner_maps(link, [_fix_mode(inner, mode) for inner in inner_maps(link)])
 
 
-def _fix_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAffine]]:
+def _list_known_rates(link: AbstractRandomAffine) -> list[tuple[float, AbstractRandomAffine]]:
     """Return the combinations of error rates and choices of a link: (probability, link with these)."""
     if isinstance(link, Flips):
         atoms = link.error.list_atoms()
         return [(float(share), Flips(Constant(p), link.dimension, link.per_message)) for share, p in atoms]
     if isinstance(link, Mixture):
         shares = zip(np.asarray(link.choice.probabilities), link.maps, strict=True)
-        return [(float(share) * p, fixed) for share, chosen in shares for p, fixed in _fix_rates(chosen)]
-    inner = [_fix_rates(part) for part in inner_maps(link)]
+        return [(float(share) * p, fixed) for share, chosen in shares for p, fixed in _list_known_rates(chosen)]
+    inner = [_list_known_rates(part) for part in inner_maps(link)]
     if prod(len(fixed) for fixed in inner) > MOST:
         raise fail("channel of a word filter", f"at most {MOST} combinations of error rates", "more")
     combinations = list(product(*inner))

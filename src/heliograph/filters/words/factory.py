@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, make_sizes
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.words.bit_likelihoods import describe_link, is_free_of_flips
-from heliograph.filters.words.two_hypotheses import keep_two_hypotheses
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.words.bit_likelihoods import is_free_of_flips, make_link_of_bits
+from heliograph.filters.words.two_hypothesis_filter import make_two_hypotheses_filter
 from heliograph.filters.words.word_filter import WordFilter
 from heliograph.filters.wrappers.delay import late_filter
 from heliograph.model.channel import Channel, check_link, perfect
@@ -64,7 +64,7 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
     return twin
 
 
-def _describe_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
+def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
     """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
     words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
     link = words[0] if len(words) == 1 else Stack(words)
@@ -126,7 +126,7 @@ def word_filter(
     # The words, the component of y (or flag) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
     places = find_places(channel)
-    links = at_each_step(describe_link, channel)
+    links = at_each_step(make_link_of_bits, channel)
     no_flips = all(is_free_of_flips(link) for link in unstack(links))
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
@@ -140,7 +140,7 @@ def word_filter(
         initial_covariance=start.initial_covariance,
         sensor=at_each_step(_take_off_rounding, sensor),
         links=links,
-        numbers=at_each_step(partial(_describe_numbers, encoder), channel),
+        numbers=at_each_step(partial(_find_moments_of_numbers, encoder), channel),
         low=words.low,
         spacing=words.step,
         centre=words.centre,
@@ -150,5 +150,5 @@ def word_filter(
         certain=no_flips,
         **make_sizes("nominal", start, len(places) + dithers),
     )
-    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else keep_two_hypotheses(one_gaussian)
+    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else make_two_hypotheses_filter(one_gaussian)
     return on_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

@@ -116,7 +116,7 @@ def _describe_system(
     x, spread = mean, covariance
     parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     for k in range(horizon):
-        motion, sensing, link = _read_step(plant, sensor, links, k)
+        motion, sensing, link = _find_models_of_step(plant, sensor, links, k)
         x, spread = motion.matrix @ x + motion.shift, motion.matrix @ spread @ motion.matrix.T + motion.covariance
         y, explained = sensing.matrix @ x + sensing.shift, sensing.matrix @ spread @ sensing.matrix.T
         signals.append((y, np.diag(explained + sensing.covariance)))
@@ -134,15 +134,15 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
     return links if len(links) > 1 else links * horizon
 
 
-def _read_step(
+def _find_models_of_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
     """Return motion, sensing and link at a step; those of step 0 where nothing varies."""
-    return _read_motion(at(plant, k)), _read_sensing(at(sensor, k)), None if links is None else links[k]
+    return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), None if links is None else links[k]
 
 
 @cache_by_object
-def _read_motion(plant: LinearPlant) -> Motion:
+def _find_motion(plant: LinearPlant) -> Motion:
     """Return A, b and Cov w with inputs zero."""
     matrix, shift, covariance = _evaluate_motion(plant)
     return Motion(matrix=np.asarray(matrix), shift=np.asarray(shift), covariance=np.asarray(covariance))
@@ -156,7 +156,7 @@ def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
 
 
 @cache_by_object
-def _read_sensing(sensor: LinearSensor) -> Sensing:
+def _find_sensing(sensor: LinearSensor) -> Sensing:
     """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error."""
     law = sensor.noise
     assert isinstance(law, RoundedNoise)

@@ -1,4 +1,4 @@
-"""The filter behind words that knows what a rounded number and a flipped bit are: exact moments of a Gaussian prior.
+"""Filter behind words of finite length, whose bits may flip: exact moments of a Gaussian prior given each word.
 
 A word is a number that was rounded to low + i D, i = 0, 1, ..., and is sent as the bits of i. A dither is a random
 number that was added before the rounding; both ends know it where it is to be taken off.
@@ -15,8 +15,8 @@ from heliograph.factors.covariance_factors import WeightedColumns, join_columns,
 from heliograph.factors.factored_gaussian import Gaussian, append_rows, impose_moments_of_combination, take_leading
 from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.base import Step, corrects
-from heliograph.filters.gaussian.belief import AbstractBeliefFilter, second_moments_at_start
-from heliograph.filters.gaussian.signal import Signal, innovation_covariance, signal_of
+from heliograph.filters.gaussian.gaussian_prediction import AbstractGaussianStateFilter, second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import Signal, find_signal_moments, innovation_covariance
 from heliograph.filters.words.bit_likelihoods import LinkOfBits
 from heliograph.filters.words.word_moments import WordEffect, find_effect_of_bits, find_effect_of_cell
 from heliograph.filters.words.word_sums import SignalPrior, WordGrid
@@ -32,7 +32,7 @@ from heliograph.random_affine.words.rounding_noise import LARGEST
 OFF = 1e-6  # steps by which a received number may miss a word
 
 
-class WordFilter(AbstractBeliefFilter):
+class WordFilter(AbstractGaussianStateFilter):
     """The Gaussian filter that conditions on the received words themselves.
 
     Of y ~ N(m, S), component after component in the joint Gaussian of the state and what is measured, a word leaves the
@@ -73,7 +73,7 @@ class WordFilter(AbstractBeliefFilter):
         joint, total = append_rows(state, signal.mean, signal.slopes, noise), jnp.zeros(())
         words = self.identify_received_words(z, at(self.links, k))
         for i in range(len(self.low)):
-            row, prior = joint.root[n + i], self.prior_of(joint, i)
+            row, prior = joint.root[n + i], self.find_signal_prior(joint, i)
             change = self._find_effect_of_word(i, words, prior)
             changes = words.present[i] & jnp.isfinite(change.log_mass) & (prior.deviation > 0)
             row = jnp.where(changes, row, 0.0)
@@ -91,7 +91,7 @@ class WordFilter(AbstractBeliefFilter):
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
         """Return the moments of y before it is rounded."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
-        return signal_of(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
+        return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
     def identify_received_words(self, z: jax.Array, link: LinkOfBits) -> "ReceivedWords":
         """Return which word of each component was received, and what its bits say of those that were sent.
@@ -118,7 +118,7 @@ class WordFilter(AbstractBeliefFilter):
         first_copies = []
         for i in range(len(self.low)):
             copies = np.flatnonzero(component == i)
-            first_copies.append(_pick_first([(arrived[j], number[j], dither[j]) for j in copies]))
+            first_copies.append(_pick_first_copy([(arrived[j], number[j], dither[j]) for j in copies]))
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
         # P(received | sent 0) and P(received | sent 1) of each bit, under each possible set of error rates of the link,
         # and the probabilities of these sets.
@@ -137,7 +137,7 @@ class WordFilter(AbstractBeliefFilter):
             are_words=~jnp.any(no_word & arrived),
         )
 
-    def prior_of(self, joint: Gaussian, i: int) -> SignalPrior:
+    def find_signal_prior(self, joint: Gaussian, i: int) -> SignalPrior:
         """Return the law of y_i in that of the state and y."""
         place = len(self.states) + i
         return SignalPrior(joint.mean[place], jnp.sqrt(joint.root[place] ** 2 @ joint.variances))
@@ -232,7 +232,7 @@ class ReceivedWords(NamedTuple):
     are_words: jax.Array
 
 
-def _pick_first(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
+def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
     """Return presence, number and dither of the first copy that came; zeros of none."""
     chosen = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
     for came, number, d in reversed(copies):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.event.truncated_normal import truncated_normal
-from heliograph.filters.words.merged_words import sum_merged, sum_overloads
-from heliograph.filters.words.word_edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
+from heliograph.filters.words.likelihood_at_word_edges import ADDED, ROOT_TWO_PI, SMOOTH, Smooth
+from heliograph.filters.words.merged_low_bits import sum_merged_words, sum_overloads
 from heliograph.filters.words.word_sums import (
     FINE,
     REACH,
@@ -48,7 +48,7 @@ def sum_by_edges(
     return LikelihoodSums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
 
 
-def sum_neighbours(
+def sum_neighbouring_words(
     pairs: list[jax.Array],
     weights: jax.Array,
     start: jax.Array,
@@ -103,7 +103,7 @@ def sum_neighbours(
     return sums
 
 
-def sum_window(
+def sum_words_near_prior(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
@@ -113,14 +113,14 @@ def sum_window(
     count = WINDOW * 2**BLOCK
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
-    sums = sum_neighbours(pairs, weights, start, WINDOW, grid, prior, dither)
+    sums = sum_neighbouring_words(pairs, weights, start, WINDOW, grid, prior, dither)
     # The word that was received, where it is none of these.
     outside = (received < start) | (received >= start + count)
     likelihood = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
-    return sums.plus(sum_cell(likelihood * outside, received, grid, prior, dither))
+    return sums.plus(sum_one_word(likelihood * outside, received, grid, prior, dither))
 
 
-def sum_cell(
+def sum_one_word(
     likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
     """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere."""
@@ -156,7 +156,7 @@ def widen_by_dither(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[Si
     return SignalPrior(prior.mean, prior.deviation * jnp.sqrt(wide)), wide
 
 
-def take_off_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
+def remove_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
     """Return what is known of y from what is known of y + d, whose variance is `wide` times that of y."""
     return WordEffect(change.log_mass, change.shift / jnp.sqrt(wide), 1 - (1 - change.ratio) / wide)
 
@@ -164,13 +164,13 @@ def take_off_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
 def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
     """Return what the word of number `index` does to y, where no bit can have flipped."""
     wider, wide = widen_by_dither(prior, grid, dither)
-    cut = take_off_dither(_cut_to_cell(index, grid, wider), wide)
+    cut = remove_dither(_cut_to_cell(index, grid, wider), wide)
     if not ADDED[dither]:
         return cut
     # A dither of steps that are not small: the edges are smooth, but far away only cells have digits.
     away = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
     width = grid.step / prior.deviation
-    smooth = find_effect_from_sums(sum_cell(jnp.ones(()), index, grid, prior, dither))
+    smooth = find_effect_from_sums(sum_one_word(jnp.ones(()), index, grid, prior, dither))
     use = (width >= FINE) & (away - width < FAR)
     return WordEffect(*(jnp.where(use, a, b) for a, b in zip(smooth, cut, strict=True)))
 
@@ -214,18 +214,18 @@ def find_effect_of_bits(
     # Few bits: all words are cheap to sum, and leave no error.
     if grid.bits <= TABLE:
         blocks = 2 ** max(grid.bits - BLOCK, 0)
-        return find_effect_from_sums(sum_neighbours(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
+        return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
     def sum_wide_words() -> WordEffect:
         """Sum word by word within the prior's reach."""
-        return find_effect_from_sums(sum_window(pairs, weights, received, grid, prior, dither))
+        return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
     def sum_fine_words() -> WordEffect:
         """Sum over cells of several words each, and over the overloads beyond the ends."""
         wider, wide = widen_by_dither(prior, grid, dither)
-        sums = [sum_merged(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
+        sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
-        return take_off_dither(find_effect_from_sums(merged), wide)
+        return remove_dither(find_effect_from_sums(merged), wide)
 
     effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)
     return effect

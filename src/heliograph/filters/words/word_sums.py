@@ -1,4 +1,4 @@
-"""What is known of a Gaussian number y by sums over words: their words, the prior, and products over their bits."""
+"""Sums over the words of a number y: likelihoods of words, products over their bits; the grid of words; the prior."""
 
 from typing import NamedTuple
 

@@ -10,12 +10,16 @@ import jax.numpy as jnp
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.factored_gaussian import Gaussian, correct_by_gain
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.factories import gaussian_filter_of
+from heliograph.filters.gaussian.factories import make_base_gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.signal import innovation_covariance, make_received_noise, signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
-from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, PolynomialMoments
+from heliograph.filters.gaussian.signal_moments import (
+    find_signal_moments,
+    innovation_covariance,
+    make_received_noise,
+)
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
@@ -103,7 +107,9 @@ class ClockFilter(AbstractWrapper):
         # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), state.gaussian
-        signal = signal_of(at(base.plant, k), sensor, base.transform, prior, second_moments_at_start(base.plant, base))
+        signal = find_signal_moments(
+            at(base.plant, k), sensor, base.transform, prior, second_moments_at_start(base.plant, base)
+        )
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = wrap_near(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
@@ -153,7 +159,7 @@ class ClockFilter(AbstractWrapper):
         """
         plant, n = at(self.base.plant, k), len(self.states)
 
-        def add_step_to_gramian(
+        def move_and_give_gramian_part(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
             """Move one step on; the output is one step's part of O'O."""
@@ -162,7 +168,7 @@ class ClockFilter(AbstractWrapper):
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
             return (plant.transition(x, state.inputs), step @ from_present), rows.T @ rows
 
-        _, squares = jax.lax.scan(add_step_to_gramian, (state.gaussian.mean, jnp.eye(n)), None, length=n)
+        _, squares = jax.lax.scan(move_and_give_gramian_part, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
 
@@ -216,7 +222,7 @@ def clock_filter(
         raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))
     # The joint Gaussian filter, to which the test of observability is added.
     chosen = PolynomialMoments(2) if transform is None else transform
-    base = gaussian_filter_of("clock filter", plant, sensor, channel, chosen, Polytope())
+    base = make_base_gaussian_filter("clock filter", plant, sensor, channel, chosen, Polytope())
     # Schmidt's update needs the moments of the channel themselves, not bounds.
     described = jax.tree.leaves(base.channel, is_leaf=lambda leaf: isinstance(leaf, SecondOrder))
     if any(isinstance(leaf, SecondOrder) and leaf.uncertain for leaf in described):

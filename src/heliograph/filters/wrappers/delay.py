@@ -20,9 +20,9 @@ from heliograph.filters.base import (
     make_sizes,
     predicts,
 )
-from heliograph.filters.gaussian.signal import link_noise
-from heliograph.filters.linear.belief import LinearBelief, PlantMotion, predict_belief
-from heliograph.filters.linear.plan import PlannedFilter, plan_filter
+from heliograph.filters.gaussian.signal_moments import factor_link_noise
+from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMotion, predict_belief
+from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_link, delayed
@@ -131,7 +131,7 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, received_line: Re
     shift = jnp.zeros(total).at[place].set(offset)
     # E Cov(r | l), by the moments of l before any data: what a random gain adds as noise is in proportion to l itself.
     mean, covariance = state.state_mean[line], state.state_covariance[line, line]
-    received = link_noise(link, covariance + jnp.outer(mean, mean), mean)
+    received = factor_link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise = WeightedColumns(
         jnp.zeros((total, received.matrix.shape[1])).at[place].set(received.matrix), received.weights
     )

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 
 from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian.belief import second_moments_at_start
-from heliograph.filters.gaussian.factories import gaussian_filter_of
+from heliograph.filters.gaussian.factories import make_base_gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter, correct_signal
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
-from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
+from heliograph.filters.gaussian.signal_moments import find_signal_moments
+from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel
@@ -135,7 +135,9 @@ class FedBackFilter(AbstractWrapper):
         """Correct with the measurement of y - r."""
         base = self.base
         plant, sensor = at(base.plant, k), at(base.sensor, k)
-        y = signal_of(plant, sensor, base.transform, state.gaussian, second_moments_at_start(base.plant, base))
+        y = find_signal_moments(
+            plant, sensor, base.transform, state.gaussian, second_moments_at_start(base.plant, base)
+        )
         # What is sent is y - r: of another mean and second moment, and the same covariance.
         mean = y.mean - state.reference
         sent = y._replace(mean=mean, second=y.covariance + jnp.outer(mean, mean))
@@ -172,7 +174,7 @@ def fed_back_filter(
         moves; Elia, Remote stabilization over fading channels (2005).
     """
     chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
-    base = gaussian_filter_of("filter that is fed back", plant, sensor, channel, chosen, rule)
+    base = make_base_gaussian_filter("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
     described = stacked(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None

@@ -73,26 +73,26 @@ class LimitedFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct the prediction, its mean held within the limits."""
-        prior = state if _is_particles(state) else self._hold_means(state)
+        prior = state if _holds_particles(state) else self._hold_means(state)
         after, innovation = self.base.correct(prior, z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
-        log_after, log_before = self._condition_with_mass(after)[0], self._condition_with_mass(state)[0]
-        are_possible = jnp.isfinite(log_after) & jnp.isfinite(log_before)
-        change = jnp.where(are_possible, log_after - log_before, 0.0)
+        log_within_after, log_within_before = self._log_probability_within(after), self._log_probability_within(state)
+        are_possible = jnp.isfinite(log_within_after) & jnp.isfinite(log_within_before)
+        change = jnp.where(are_possible, log_within_after - log_within_before, 0.0)
         return after, replace(innovation, log_likelihood=innovation.log_likelihood + change)
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Return the mean and covariance given that the state lies within the limits."""
-        return self._with_own_claim(self.base.estimate(self.condition(state)))
+        return self._with_own_claim(self.base.estimate(self.condition_on_limits(state)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """Return the mean and covariance after step k, given that the state lies within the limits."""
-        return self._with_own_claim(self.base.after_step(self.condition(state), k))
+        return self._with_own_claim(self.base.after_step(self.condition_on_limits(state), k))
 
-    def condition(self, state: PyTree) -> PyTree:
+    def condition_on_limits(self, state: PyTree) -> PyTree:
         """Return the state of the filter within, given that the plant's state lies within the limits."""
-        return self._condition_with_mass(state)[1]
+        return self._condition_with_log_probability(state)[1]
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of the filter within, whose estimates are then conditioned on the limits."""
@@ -123,7 +123,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     def _state_before_prediction(self, state: PyTree) -> PyTree:
         """Return the state from which the next prediction starts."""
-        return self.condition(state) if _is_particles(state) else self._hold_means(state)
+        return self.condition_on_limits(state) if _holds_particles(state) else self._hold_means(state)
 
     def _hold_means(self, state: PyTree) -> PyTree:
         """Return a filter's state with the means of its Gaussians held within the limits."""
@@ -131,26 +131,30 @@ class LimitedFilter(AbstractSizedFilter):
             return state._replace(base=self._hold_means(state.base))
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
             return state._replace(believed=self._hold_means(state.believed), rival=self._hold_means(state.rival))
-        if _is_particles(state):
+        if _holds_particles(state):
             return state
         x = Gaussian(*map(jnp.asarray, gaussian_of(state)))
-        hold = jax.vmap(self._hold_one) if x.mean.ndim == 2 else self._hold_one
+        hold = jax.vmap(self._hold_mean) if x.mean.ndim == 2 else self._hold_mean
         return with_gaussian(state, hold(x))
 
-    def _hold_one(self, x: Gaussian) -> Gaussian:
+    def _hold_mean(self, x: Gaussian) -> Gaussian:
         """Return one Gaussian with its mean held within the limits."""
         return hold_mean_within_limits(x, self.limits)
 
-    def _condition_with_mass(self, state: PyTree) -> tuple[jax.Array, PyTree]:
+    def _log_probability_within(self, state: PyTree) -> jax.Array:
+        """Return the log probability that the plant's state lies within the limits, of a filter in this state."""
+        return self._condition_with_log_probability(state)[0]
+
+    def _condition_with_log_probability(self, state: PyTree) -> tuple[jax.Array, PyTree]:
         """Return the log probability that the plant's state lies within the limits, and the filter's state given that.
 
         A filter's state is one that holds another filter's state, particles, a Gaussian, or a mixture of Gaussians.
         """
         if isinstance(state, StateUnderInputs):
-            log_mass, inner = self._condition_with_mass(state.base)
+            log_mass, inner = self._condition_with_log_probability(state.base)
             return log_mass, state._replace(base=inner)
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
-            log_mass, inner = self._condition_with_mass(state.believed)
+            log_mass, inner = self._condition_with_log_probability(state.believed)
             return log_mass, state._replace(believed=inner)
         if isinstance(state, particles.StateParticles):
             return self._condition_particles(state)
@@ -193,7 +197,7 @@ class LimitedFilter(AbstractSizedFilter):
         )
 
 
-def _is_particles(state: PyTree) -> bool:
+def _holds_particles(state: PyTree) -> bool:
     """Return whether a filter's state, or that of the filter within one of sensor inputs, is of particles."""
     return isinstance(getattr(state, "base", state), particles.StateParticles)
 

@@ -51,11 +51,11 @@ class AbstractWrapper(AbstractSizedFilter):
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
         """Return the mean and covariance of the estimate."""
-        return self._claim_first_states(self.base.estimate(self.within(state)))
+        return self._restrict_to_first_states(self.base.estimate(self.within(state)))
 
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """Return the mean and covariance after step k."""
-        return self._claim_first_states(self.base.after_step(self.within(state), k))
+        return self._restrict_to_first_states(self.base.after_step(self.within(state), k))
 
     def angles_used(self) -> FilterAngles | None:
         """Return the angles of the filter within, of its states those that are estimated."""
@@ -81,7 +81,7 @@ class AbstractWrapper(AbstractSizedFilter):
         """True if a step at which nothing arrives changes the state of the filter within."""
         return self.base.silence_tells
 
-    def _claim_first_states(self, whole: Estimate) -> Estimate:
+    def _restrict_to_first_states(self, whole: Estimate) -> Estimate:
         """Return mean and covariance of the first states, under this filter's own claim."""
         n = len(self.states)
         mean, covariance = whole.mean[..., :n], whole.covariance[..., :n, :n]

@@ -1,12 +1,5 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .gains import NeighbourEstimates as NeighbourEstimates
-from .gains import NeighbourWeights as NeighbourWeights
-from .gains import NodeGains as NodeGains
-from .gains import NodeStep as NodeStep
-from .gains import correct_by_information as correct_by_information
-from .gains import gains_of as gains_of
-from .gains import information_of as information_of
 from .graph import Graph as Graph
 from .graph import Neighbours as Neighbours
 from .graph import find_upstream_nodes as find_upstream_nodes
@@ -19,3 +12,10 @@ from .joint_error_covariance import propagate_joint_covariance as propagate_join
 from .joint_error_covariance import scatter_blocks as scatter_blocks
 from .neighbour_rules import DiffusionWeights as DiffusionWeights
 from .neighbour_rules import FrozenWeights as FrozenWeights
+from .node_gains import NeighbourEstimates as NeighbourEstimates
+from .node_gains import NeighbourWeights as NeighbourWeights
+from .node_gains import NodeGains as NodeGains
+from .node_gains import NodeStep as NodeStep
+from .node_gains import correct_by_information as correct_by_information
+from .node_gains import gains_of as gains_of
+from .node_gains import information_of as information_of

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.fusion.mesh.gains import NodeGains
+from heliograph.fusion.mesh.node_gains import NodeGains
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float, Int
@@ -56,21 +56,28 @@ def scatter_blocks(
 
 
 def propagate_joint_covariance(
-    joint: Float[Array, "N N"], m: Any, f: Float[Array, "node n n"], noise: Float[Array, "n n"], ws: Any, w: Any
+    joint: Float[Array, "N N"],
+    transition: Any,
+    innovation: Float[Array, "node n n"],
+    process_noise: Float[Array, "n n"],
+    weighted_information: Any,
+    weights: Any,
 ) -> Float[Array, "N N"]:
-    """Return the joint covariance J+ of all nodes' errors after a step, symmetric, from J before it.
+    """Return J+ = M J M' + F Q F' + (W S) W', the joint covariance of all nodes' errors after a step, symmetric.
 
     Args:
-        joint: J.
-        m: M (N, N).
-        f: F_i of each node.
-        noise: Q.
-        ws: matrix (N, N) of the blocks W_i S_j of the measurements that node i has.
-        w: matrix (N, N) of the blocks W_i of these.
+        joint: J before the step.
+        transition: M (N, N), of the blocks M_ij.
+        innovation: F_i of each node, one below the other in F.
+        process_noise: Q.
+        weighted_information: matrix W S (N, N) of the blocks W_i S_j of the measurements that node i has.
+        weights: matrix W (N, N) of the blocks W_i of these.
     """
-    measured = ws @ w.T
-    added = propagate_by_mode(f.reshape(len(joint), -1), noise, measured if is_traced(measured) else measured.toarray())
-    after = propagate_by_mode(m, joint, added)
+    measured = weighted_information @ weights.T
+    # Sparse matrices, outside of a program, are made dense before they are added.
+    measured = measured if is_traced(measured) else measured.toarray()
+    added = propagate_by_mode(innovation.reshape(len(joint), -1), process_noise, measured)
+    after = propagate_by_mode(transition, joint, added)
     symmetric: Float[Array, "N N"] = (after + after.T) / 2
     return symmetric
 

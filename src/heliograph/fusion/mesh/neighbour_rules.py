@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code
-from heliograph.fusion.intersection import choose_shares_by_trace, intersection_weights
-from heliograph.fusion.mesh.gains import (
+from heliograph.fusion.covariance_intersection import choose_shares_by_trace, intersection_weights
+from heliograph.fusion.mesh.graph import Graph
+from heliograph.fusion.mesh.node_gains import (
     NeighbourEstimates,
     NeighbourWeights,
     NodeGains,
     NodeStep,
     correct_by_information,
 )
-from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.rules import AbstractFusion, AbstractIntersection, Covariances, Fused, Means
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import InputError, check_count, fail, scalar, table
@@ -134,9 +134,15 @@ class DiffusionWeights(_NeighbourRule):
         corrected, innovation = correct_by_information(predicted, jnp.asarray(step.complete))
         assert self.shares is not None
         shares = jnp.where(believed.present, jnp.asarray(self.shares), 0.0)
-        # What arrived alone corrects.
+        # The gains are those of all measurements; only what arrived corrects: F = I - P S of the measurements that did.
         used = jnp.eye(len(a)) - corrected @ step.arrived
-        return NodeGains(innovation @ a, shares[:, None] * jnp.ones(len(a)), corrected, used, corrected)
+        return NodeGains(
+            front=innovation @ a,
+            parts=shares[:, None] * jnp.ones(len(a)),
+            gain=corrected,
+            innovation=used,
+            covariance=corrected,
+        )
 
 
 class FrozenWeights(_NeighbourRule):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.filters.filter_for_likelihood import likelihood_filter
 from heliograph.learning.free_network import Build, Description
 from heliograph.model.channel import Channel
 from heliograph.model.enlarged.joint_sensors import join_links

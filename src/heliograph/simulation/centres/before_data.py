@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import LinearStep
+from heliograph.filters.linear.precomputed_filter import LinearStep
 from heliograph.fusion.cross_covariance import ErrorSources, SourceFactors, make_initial_factors
 from heliograph.fusion.joint_covariance_fusion import MatrixWeights
 from heliograph.fusion.joint_covariance_weights import matrix_weights, solve_factored_weights

@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.linear.plan import Linearised, LinearStep, linear_step
-from heliograph.fusion.all_reports import (
+from heliograph.filters.linear.precomputed_filter import LinearisedStep, LinearStep, linear_step
+from heliograph.fusion.all_reports_fusion import (
     ReportsBelief,
     correct_with_reports,
     estimate_state,
@@ -161,7 +161,7 @@ class FusionCentre(Module):
 
 # Axes of a filter's matrices that are as long as its measurement, counted from the last.
 MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, -1), "noise": (-2, -1)}
-Matrices = TypeVar("Matrices", LinearStep, Linearised)
+Matrices = TypeVar("Matrices", LinearStep, LinearisedStep)
 
 
 def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.adaptive import AdaptiveBelief
-from heliograph.filters.linear.belief import LinearBelief
+from heliograph.filters.linear.linear_filter_state import LinearBelief
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.smoother_step import gaussian_of, with_gaussian
 from heliograph.fusion.network_fusion import Fusion

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import make_sizes
-from heliograph.fusion.all_reports import AllReports
+from heliograph.fusion.all_reports_fusion import AllReports
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import widen_by_quantization

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.linear.plan import Linearised, linearise_step
-from heliograph.fusion.all_reports import AllReports, ReportsBelief
+from heliograph.filters.linear.precomputed_filter import LinearisedStep, linearise_step
+from heliograph.fusion.all_reports_fusion import AllReports, ReportsBelief
 from heliograph.fusion.cross_covariance import (
     ErrorMap,
     ErrorMoments,
@@ -69,7 +69,7 @@ class LinearisedCentre(Module):
     def step(
         self,
         state: dict[str, LinearisedFusionState],
-        parts: Sequence[Linearised],
+        parts: Sequence[LinearisedStep],
         means: Sequence[jax.Array],
         u: jax.Array,
         k: jax.Array,
@@ -107,7 +107,7 @@ class LinearisedCentre(Module):
         return following, results
 
 
-def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
+def _make_shared_step(motion: Motion, keep: jax.Array, linear: LinearisedStep) -> ErrorStep:
     """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
 
     The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
@@ -135,7 +135,7 @@ def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMomen
 
 
 def _compute_drift(
-    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised
+    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
     """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
 

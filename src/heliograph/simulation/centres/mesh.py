@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.size_thresholds import MESH
+from heliograph.engine.limits import MESH
+from heliograph.fusion.covariance_intersection import invert_positive_definite
 from heliograph.fusion.cross_covariance import Motion, propagate_state
-from heliograph.fusion.intersection import invert
-from heliograph.fusion.mesh.gains import (
+from heliograph.fusion.mesh.joint_error_covariance import blocks_of
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.mesh.node_gains import (
     NeighbourEstimates,
     NeighbourWeights,
     NodeGains,
     NodeStep,
     gains_of,
 )
-from heliograph.fusion.mesh.joint_error_covariance import blocks_of
-from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.estimate import Claim, Estimate
@@ -210,7 +210,7 @@ class Mesh(Module):
         if state.sent is None or self.alpha is None:
             return now
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
-        information = jax.vmap(invert)(state.covariance)[self.senders]
+        information = jax.vmap(invert_positive_definite)(state.covariance)[self.senders]
         moved = find_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
@@ -288,7 +288,7 @@ class Mesh(Module):
             ahead: weights computed before, by bucket.
             senders: row of `covariance` for each message that a node receives (node, degree); None for the graph's.
         """
-        information, traces = jax.vmap(invert)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
+        information, traces = jax.vmap(invert_positive_definite)(covariance), jnp.trace(covariance, axis1=1, axis2=2)
         # Axes of the nodes: the last of a rule's arrays, the first of all else.
         over_nodes = eqx.filter_vmap(function, in_axes=(eqx.if_array(-1), *[0] * (2 + len(rest))))
         # Bucket by bucket: nodes of about as many neighbours.

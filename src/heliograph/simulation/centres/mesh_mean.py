@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.mesh.gains import NodeGains
 from heliograph.fusion.mesh.graph import graph_of
 from heliograph.fusion.mesh.joint_error_covariance import (
     blocks_of,
@@ -28,6 +27,7 @@ from heliograph.fusion.mesh.joint_error_covariance import (
     scatter_blocks,
 )
 from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.mesh.node_gains import NodeGains
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.linear.jump_system import propagate_by_mode

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.cross_covariance import JointObservation, Motion
-from heliograph.fusion.mesh.gains import NeighbourEstimates, NeighbourWeights, NodeGains, information_of
 from heliograph.fusion.mesh.joint_error_covariance import (
     error_transitions,
     measurement_weights,
     propagate_joint_covariance,
     scatter_blocks,
 )
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights, NodeGains, information_of
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.fusion.cross_covariance import Motion
-from heliograph.fusion.mesh.gains import correct_by_information
+from heliograph.fusion.mesh.node_gains import correct_by_information
 from heliograph.fusion.quantizer import AbstractQuantizer, widen_by_quantization
 from heliograph.numerics.types import Array, Bool, Float, Int
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian.signal import augmented_second_moment
+from heliograph.filters.gaussian.signal_moments import augmented_second_moment
 from heliograph.fusion.cross_covariance import JointObservation
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, at_each_step, stack

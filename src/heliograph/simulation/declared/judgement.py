@@ -8,8 +8,8 @@ import numpy as np
 import scipy
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_data import check_data
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.filters.run_over_data import check_data
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.model.enlarged.bias import with_bias
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant

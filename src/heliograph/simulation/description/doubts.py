@@ -9,8 +9,8 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.words.linear import SEEN
-from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
+from heliograph.filters.words.linear_word_filter import SEEN
+from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typical
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix

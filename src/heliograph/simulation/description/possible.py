@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.transform import AbstractTransform, Linearization
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Linearization
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
 from heliograph.model.over_time import first

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
-from heliograph.filters.gaussian.transform import Cubature
+from heliograph.filters.gaussian.moment_transforms import Cubature
 from heliograph.filters.gaussian.unscented import Unscented
 from heliograph.model.over_time import first
 from heliograph.model.sensor import is_linear

@@ -2,7 +2,7 @@
 
 from typing_extensions import TypeAliasType
 
-from heliograph.filters.words.linear import LinearWordsFilter
+from heliograph.filters.words.linear_word_filter import LinearWordsFilter
 from heliograph.filters.words.overload import Overload
 from heliograph.simulation.network import Network
 

@@ -9,8 +9,8 @@ import scipy
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_data import check_data
 from heliograph.filters.innovation import HALF
+from heliograph.filters.run_over_data import check_data
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.check import array, check_count, fail, instance, rank
 from heliograph.numerics.confidence_intervals import average_correlated

@@ -1,0 +1,146 @@
+"""Log probability, mean and covariance of a Gaussian that is known to lie in a ball, or outside of it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import WeightedColumns, eliminate, join_columns, zero_covariance
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns
+from heliograph.filters.event.gaussian_sum import GaussianSum
+from heliograph.filters.event.truncated_normal import truncated_normal, upper_tail
+from heliograph.filters.truncation import CERTAIN
+from heliograph.numerics.lapack import eigh
+
+MOST_COMPONENTS = 3  # nodes are a grid over all but one of them
+REACH = 9.0  # deviations from the centre beyond which there is no probability that counts
+NODES, WEIGHTS = (array / 2 for array in np.polynomial.legendre.leggauss(32))
+NODES = NODES + 0.5  # on (0, 1)
+
+
+class BallMoments(NamedTuple):
+    """log P(e in the region), and mean (m,) and covariance (m, m) of e there."""
+
+    log_mass: jax.Array
+    mean: jax.Array
+    covariance: jax.Array
+
+
+def ball_moments(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Return log probability, mean and covariance of independent e_i ~ N(centre_i, variance_i) in a ball or outside.
+
+    By recursion on the components. Given e_1 = radius sin(t), the others lie in (or outside) a ball of the radius
+    radius cos(t): the same problem with one component less, of which the last is a truncated normal number. The
+    integral over t is a sum over 32 Gauss-Legendre nodes. Its terms are joined as a mixture is, from their means and
+    covariances, so that no variance is negative.
+
+    Args:
+        centre: means (m,).
+        variance: variances (m,), positive.
+        radius: of the ball about 0, ().
+        inside: |e| <= radius; else |e| > radius.
+    """
+    if len(centre) == 1:
+        return _join_pieces(_truncate_component(centre[0], variance[0], radius, inside))
+    pieces = _slice_by_first_component(centre, variance, radius, inside)
+    if not inside:
+        pieces = _append_outer_tails(pieces, centre, variance, radius)
+    return _join_pieces(pieces)
+
+
+def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Return the moments at each node e_1 = radius sin(t), (node, ...), with the log of the node's share of the mass.
+
+    Arguments as `ball_moments`. |e_1| <= radius at all nodes.
+    """
+    # t only where e_1 has its probability: within REACH deviations of the point of [-radius, radius] that is nearest to
+    # its mean.
+    first, deviation = centre[0], jnp.sqrt(variance[0])
+    near = jnp.clip(first, -radius, radius)
+    low, high = (jnp.arcsin(jnp.clip((near + side * REACH * deviation) / radius, -1.0, 1.0)) for side in (-1.0, 1.0))
+    angle = low + (high - low) * NODES
+    e = radius * jnp.sin(angle)
+    # The other components, given e_1.
+    others = jax.lax.map(lambda r: ball_moments(centre[1:], variance[1:], r, inside), radius * jnp.cos(angle))
+    # log of the node's weight in t, of de_1 / dt = radius cos(t), and of the density of e_1.
+    weight = jnp.log(WEIGHTS * (high - low) * radius * jnp.cos(angle) / deviation) - np.log(2 * np.pi) / 2
+    weight = weight - ((e - first) / deviation) ** 2 / 2
+    mean = jnp.concatenate([e[:, None], others.mean], axis=1)
+    covariance = jnp.zeros((len(e), *variance.shape * 2)).at[:, 1:, 1:].set(others.covariance)
+    return BallMoments(weight + others.log_mass, mean, covariance)
+
+
+def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
+    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere."""
+    tails = _truncate_component(centre[0], variance[0], radius, inside=False)
+    mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
+    free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
+    outer_pieces = BallMoments(tails.log_mass, mean, covariance=free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
+    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, outer_pieces, strict=True)))
+
+
+def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
+    """Return the sum with each Gaussian x of N components cut to |D x| <= radius, or to |D x| > radius.
+
+    A cut Gaussian is replaced by the Gaussian of the same mean and covariance, and its weight is multiplied by the
+    probability of the region. With Cov(D x) = V diag(s) V', e = V' D x has independent components with moments E e and
+    Cov e in the region, and x = m + K (e - V' D m) + rest, K = Cov(x, e) diag(s)^-1, the rest independent of e. So
+    the mean becomes m + K (E e - V' D m), and the covariance Cov(x | e) + K Cov(e) K'.
+
+    Args:
+        parts: the sum of K Gaussians.
+        directions: D (m, N).
+        radius: of the ball, ().
+        inside: |D x| <= radius; else |D x| > radius.
+    """
+
+    def truncate_one(x: Gaussian) -> tuple[jax.Array, Gaussian]:
+        """Return the log probability of the region under one Gaussian, and the Gaussian cut to it."""
+        # e = V' D x: rows of its slopes, means and variances.
+        rows, centre = directions @ x.root, directions @ x.mean
+        variance, turn = eigh(WeightedColumns(rows, x.variances).covariance)
+        # Components without variance, up to rounding, stay where they are.
+        least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
+        rows, centre = turn.T @ rows, turn.T @ centre
+        variance_or_least = jnp.maximum(variance, least)
+        moments = ball_moments(centre, variance_or_least, radius, inside)
+        varies = (variance > least) & jnp.isfinite(moments.log_mass)
+        gain = jnp.where(varies, (x.root * x.variances) @ rows.T / variance_or_least, 0.0)
+        # x given e, without noise; then what e itself still varies in the region.
+        given, _ = condition_on_observation(x, rows, jnp.zeros(len(rows)), zero_covariance(len(rows)), varies)
+        mean = x.mean + gain @ jnp.where(varies, moments.mean - centre, 0.0)
+        spread = eliminate(moments.covariance).through(gain)
+        return moments.log_mass, from_columns(mean, join_columns(given.columns, spread))
+
+    log_mass, after = jax.lax.map(truncate_one, parts.gaussian)
+    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
+
+
+def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
+    """Return the moments of e ~ N(centre, variance) in [-radius, radius], (1, ...), or below and above it, (2, ...)."""
+    deviation = jnp.sqrt(variance)
+    edge = jnp.array([-1.0, 1.0]) * radius
+    if inside:
+        side, moments = jnp.ones(1), truncated_normal((edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation)
+    else:
+        side = jnp.array([-1.0, 1.0])
+        moments = upper_tail((radius - side * centre) / deviation)
+    possible = jnp.isfinite(moments.log_mass)
+    mean = jnp.where(possible, centre + deviation * side * moments.mean, centre)
+    spread = jnp.where(possible, variance * moments.variance, variance)
+    return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
+
+
+def _join_pieces(pieces: BallMoments) -> BallMoments:
+    """Return the moments of the mixture of pieces (piece, ...), each weighted by its mass; log of their whole mass."""
+    # Masses relative to the largest one; where none has any, equal shares.
+    top = jnp.max(pieces.log_mass)
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    weight = jnp.exp(pieces.log_mass - top)
+    total = jnp.sum(weight)
+    share = jnp.where(total > 0, weight, 1.0) / jnp.where(total > 0, total, len(weight))
+    mean = share @ pieces.mean
+    apart = pieces.mean - mean
+    covariance = jnp.tensordot(share, pieces.covariance + apart[:, :, None] * apart[:, None], axes=1)
+    return BallMoments(top + jnp.log(total), mean, covariance)

@@ -1,0 +1,36 @@
+"""Probabilities of what is unknown of a sender (how long ago it sent, what was lost), given each Gaussian of a sum.
+
+They are the sender's label, an array (K, M, A, C): Gaussian, mode of the link, steps since the last transmission,
+transmissions lost.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class SilenceByCause(NamedTuple):
+    """A sender's label (K, M, A, C), split by why no value came, before it is known where y - r lies.
+
+    unsent: nothing was sent, if |y - r| <= delta; dropped: sent and lost, if |y - r| > delta; forced: sent wherever y
+    lay, since a heartbeat was due, and lost.
+    """
+
+    unsent: jax.Array
+    dropped: jax.Array
+    forced: jax.Array
+
+
+def status_after_sending(label: jax.Array, lost: bool) -> jax.Array:
+    """Return a sender's label (K, M, A, C) after a transmission: 0 steps since then, and one more lost or none.
+
+    The last entry of C counts all larger numbers too; with C = 1 losses are not counted.
+    """
+    label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
+    if label.shape[-1] == 1:
+        return label
+    if not lost:
+        return jnp.zeros_like(label).at[..., 0].set(jnp.sum(label, axis=-1))
+    more = jnp.concatenate([jnp.zeros_like(label[..., :1]), label[..., :-1]], axis=-1)
+    return more.at[..., -1].add(label[..., -1])

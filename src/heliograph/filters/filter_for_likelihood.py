@@ -1,0 +1,43 @@
+"""Choice of the filter that a likelihood is computed by, by plant and channel: Kalman, linear, IMM or cubature."""
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.factories import cubature_filter, kalman_filter
+from heliograph.filters.linear.linear import linear_filter
+from heliograph.filters.modes.multiple_model import imm_filter
+from heliograph.model.channel import Channel
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, check_sensor
+from heliograph.model.unknown_start import UnknownStart
+from heliograph.numerics.check import fail, flag, instance
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.memories_of_channels import memories
+
+
+def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: bool) -> AbstractFilter:
+    """Return the filter by whose innovations a likelihood is computed, chosen by what plant and channel are.
+
+    Args:
+        plant: the plant; of several modes by `imm_filter`, of an unknown start by `kalman_filter`.
+        sensor: its sensor.
+        channel: from the sensor to the filter.
+        linear: by the state's unconditional moments, `linear_filter`; else by those given data, `cubature_filter`.
+
+    Raises:
+        ValueError: parts that do not fit; a channel beside an unknown start.
+
+    Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965), by the innovations of each.
+    """
+    if memories((plant, sensor)):
+        return imm_filter(plant, sensor, channel)
+    start = check_plant(plant)
+    check_sensor(first(sensor), len(start.states))
+    link = instance("channel", first(channel), AbstractRandomAffine, "a channel")
+    if isinstance(start.initial_covariance, UnknownStart):
+        if words := link.in_words():
+            raise fail("channel of a network to be learned", "perfect() beside an unknown start", words)
+        return kalman_filter(plant, sensor)
+    if flag("linear", linear):
+        return linear_filter(plant, sensor, channel)
+    return cubature_filter(plant, sensor, without_memory(channel))

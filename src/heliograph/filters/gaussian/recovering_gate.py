@@ -1,0 +1,251 @@
+"""A gate that recovers from locking out: it takes up a rival state once that explains what it refused for long."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import WeightedColumns, join_columns
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.gaussian.robust import Gate, RobustFilter
+from heliograph.filters.gaussian.robust_scores import PredictedMeasurement
+from heliograph.filters.remark import Remark
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import at
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.angle import wrap_near
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import ArrayLike, Float
+
+CONTRADICTED = float(np.log(1000.0))  # the other numbers speak for the gated state 1000 to 1
+NEVER = -1.0  # step of the last giving in, before the first
+
+
+class GateAndRival(NamedTuple):
+    """What a gate believes, and the rival state that believes what the gate refuses.
+
+    Args:
+        believed: the state of the gate.
+        rival: the state that was opened for each number that the gate refuses; `believed` while it refuses none.
+        refused: of each received number, how often in a row it was refused (m,).
+        elapsed: time since the first of these refusals; 0 of a plant without the input dt.
+        evidence: log likelihood of the numbers that are not refused, under the rival over that under the gate.
+        given_in: how often the gate has given in.
+        step: when it last did, -1 before.
+        moved: by how much each state moved then, from the gate's to the rival's (n,).
+    """
+
+    believed: Gaussian
+    rival: Gaussian
+    refused: Float[jax.Array, " m"]
+    elapsed: Float[jax.Array, ""]
+    evidence: Float[jax.Array, ""]
+    given_in: Float[jax.Array, ""]
+    step: Float[jax.Array, ""]
+    moved: Float[jax.Array, " n"]
+
+
+class GivingInFilter(AbstractSizedFilter):
+    """A gate that takes up its rival once it has refused a number for long, unless other numbers contradict.
+
+    From the first refusal on a rival is carried beside the state of the gate: it uses what the gate refuses. Let e be
+    the innovation of a refused number, t its noiseless value and V = Var t under the rival. Of all changes of the state
+    that explain e the most probable one is delta = Cov(x, t) e / V: it says which states, and how far. Where the gate
+    would refuse e under the rival too, the rival's covariance becomes P + n diag(delta^2) / min(c, 1), each of the n
+    states by itself, since how they were tied is as doubtful as where they were. What t is then wider by is at least
+    e^2 / min(c, 1) (the inequality of Cauchy and Schwarz), so that e^2 is at most c variances, and e is used.
+
+    Either the sensor is wrong or the state is. The numbers that are not refused tell: `evidence` sums their log density
+    under the rival less that under the gate, of each at most c / 2 off. If the rival is right, it falls to -log 1000
+    once in 1000 times at most (a ratio of likelihoods is a martingale); if the sensor is wrong, it falls the more the
+    longer the rival follows it. After `after` refusals in a row, or `seconds` of them, the gate gives in unless it has.
+
+    Args:
+        base: the gate.
+        after: number of refusals in a row; None for none.
+        seconds: time of refusals in a row; None for none.
+
+    Claim: "nominal".
+    Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in
+        linear systems (1976), for a jump of the state that is tested beside the filter.
+    """
+
+    base: RobustFilter
+    after: int | None = eqx.field(static=True)
+    seconds: float | None = eqx.field(static=True)
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of the gate."""
+        return self.base.angles_used()
+
+    @compile_on_call
+    def init(self) -> GateAndRival:
+        """Return the belief before any data."""
+        start, zero = self.base.init(), jnp.zeros(())
+        return GateAndRival(
+            believed=start,
+            rival=start,
+            refused=jnp.zeros(self.received),
+            elapsed=zero,
+            evidence=zero,
+            given_in=zero,
+            step=zero + NEVER,
+            moved=jnp.zeros(len(self.states)),
+        )
+
+    @predicts
+    def predict(self, state: GateAndRival, u: ArrayLike = (), k: Step = 0) -> GateAndRival:
+        """Predict the gate's state and its rival over step k."""
+        elapsed = state.elapsed
+        if TIME_STEP in self.inputs:
+            passes = jnp.asarray(u, dtype=float)[self.inputs.index(TIME_STEP)]
+            elapsed = jnp.where(jnp.any(state.refused > 0), elapsed + passes, 0.0)
+        believed, rival = (self.base.predict(x, u, k) for x in (state.believed, state.rival))
+        return state._replace(believed=believed, rival=rival, elapsed=elapsed)
+
+    @corrects
+    def correct(self, state: GateAndRival, z: ArrayLike, k: Step = 0) -> tuple[GateAndRival, Innovation]:
+        """Correct the gate's state with z (m,), and the rival with what the gate refuses too; then choose between them.
+
+        The gate gives in, and the rival's state is believed from now on, where a number has been refused for long and
+        the numbers that were not refused do not contradict the rival.
+        """
+        # The gate's own update, and which numbers it refused: how often in a row.
+        z = jnp.asarray(z)
+        arrived = ~jnp.isnan(z)
+        after, innovation = self.base.correct(state.believed, z, k)
+        left_out = arrived & (_get_weights_of_received(innovation) < 0.5)  # a gate's weights are 0 and 1
+        refused = jnp.where(arrived, jnp.where(left_out, state.refused + 1, 0.0), state.refused)
+        suspect = refused > 0
+        # The rival, its prior widened where it would refuse what the gate does. It begins as the gate's state.
+        prior = _select_tree(jnp.any(state.refused > 0), state.rival, state.believed)
+        opened = self._widen_prior(prior, z, left_out, k)
+        rival, rival_innovation = self.base.correct(opened, z, k)
+        evidence = state.evidence + self._compare_densities(rival_innovation, innovation, arrived & ~suspect)
+        # Give in after refusals for long enough, unless the other numbers contradict the rival. A rival ends where the
+        # gate gives in, or no number is refused any more: both states are then the chosen one.
+        gives_in = self._is_refused_long(refused, state.elapsed) & (evidence > -CONTRADICTED)
+        rival_continues = jnp.any(suspect) & ~gives_in
+        jump = wrap_near(rival.mean, after.mean, self.angles_used().states) - after.mean
+        chosen = _select_tree(gives_in, rival, after)
+        belief = GateAndRival(
+            believed=chosen,
+            rival=_select_tree(rival_continues, rival, chosen),
+            refused=jnp.where(gives_in, 0.0, refused),
+            elapsed=jnp.where(rival_continues, state.elapsed, 0.0),
+            evidence=jnp.where(rival_continues, evidence, 0.0),
+            given_in=state.given_in + gives_in,
+            step=jnp.where(gives_in, jnp.asarray(k, dtype=float), state.step),
+            moved=jnp.where(gives_in, jump, state.moved),
+        )
+        return belief, _select_tree(gives_in, rival_innovation, innovation)
+
+    def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
+        """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
+
+        `refused`: of each received number, its refusals in a row (m,); `elapsed`: time since the first of them.
+        """
+        is_long = jnp.zeros((), dtype=bool)
+        if self.after is not None:
+            is_long = is_long | jnp.any(refused >= self.after)
+        if self.seconds is not None:
+            # One refusal alone, after which nothing came, is an outlier however long ago it was.
+            is_long = is_long | (jnp.any(refused > 1) & (elapsed >= self.seconds))
+        return is_long
+
+    def _widen_prior(self, prior: Gaussian, z: jax.Array, left_out: jax.Array, k: Step) -> Gaussian:
+        """Return the rival's prior, widened so that the gate's rule lets it use the numbers (m,) that were `left_out`.
+
+        It is widened only for numbers that the rule would refuse under this prior too.
+        """
+        predicted, _ = self.base.predict_received(prior, k)
+        noise, rule = at(self.base.noise, k), _get_gate_rule(self.base)
+        # Innovation e, its variance S, and V = Var t of the state alone.
+        total = predicted.columns.diagonal + jnp.diagonal(jnp.asarray(noise.covariance))
+        e = wrap_near(z, predicted.signal, self.base.received_angles) - predicted.signal - noise.center
+        of_state = predicted.slopes**2 @ predicted.prior.variances
+        needs_room = left_out & (e**2 > rule.c * total) & (of_state > 0)
+        # delta of each number that is to be used, (n, m); each state by itself.
+        change = _find_most_probable_change(predicted, jnp.where(needs_room, e, 0.0), of_state)
+        # P + n diag(delta^2) / min(c, 1), summed over these numbers.
+        n = len(self.states)
+        wider = WeightedColumns(jnp.eye(n), n / jnp.minimum(rule.c, 1.0) * jnp.sum(change**2, axis=1))
+        return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
+
+    def _compare_densities(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
+        """Return the summed log density of the numbers that count (m,) under the rival less that under the gate."""
+
+        def log_density(innovation: Innovation) -> jax.Array:
+            """Return the log density of each number that counts, of squares up to the gate's limit c, without 2 pi."""
+            variance = jnp.diagonal(jnp.asarray(innovation.covariance))
+            variance = jnp.where(counts, variance, 1.0)
+            squared = jnp.where(counts, jnp.asarray(innovation.value), 0.0) ** 2 / variance
+            return -(jnp.minimum(squared, _get_gate_rule(self.base).c) + jnp.log(variance)) / 2
+
+        return jnp.sum(log_density(rival) - log_density(gate))
+
+    @estimates
+    def estimate(self, state: GateAndRival) -> Estimate:
+        """Return the mean and covariance of the gate's state."""
+        return self.base.estimate(state.believed)
+
+    def remark(self, state: GateAndRival) -> Remark:
+        """Say how often the gate has given in, when it last did, and which states moved how far then."""
+        times = int(state.given_in)
+        if not times:
+            return Remark()
+        moved = ", ".join(f"{name} by {far:.3g}" for name, far in zip(self.states, state.moved.tolist(), strict=True))
+        often = "once" if times == 1 else f"{times} times"
+        return Remark(times, f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}")
+
+
+def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
+    """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m)."""
+    prior = predicted.prior
+    cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
+    return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))
+
+
+def _get_weights_of_received(innovation: Innovation) -> jax.Array:
+    """Return the weights of the received numbers (m,)."""
+    return jnp.asarray(innovation.weight)
+
+
+def _get_gate_rule(base: RobustFilter) -> Gate:
+    """Return the rule of a filter whose rule is a gate."""
+    assert isinstance(base.rule, Gate)
+    return base.rule
+
+
+def _select_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """Return the tree of arrays `if_true` where the condition holds, else `if_false`."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
+
+
+def build_giving_in_filter(base: RobustFilter, rule: Gate) -> GivingInFilter:
+    """Return the gate that gives in as its rule says.
+
+    Args:
+        base: the gate.
+        rule: its rule.
+
+    Raises:
+        ValueError: seconds of a plant without the input dt.
+    """
+    if rule.seconds is not None and TIME_STEP not in base.inputs:
+        raise fail("seconds of a gate", f"a plant with the input {TIME_STEP!r}, or after= refusals", list(base.inputs))
+    return GivingInFilter(
+        base=base, after=rule.after, seconds=rule.seconds, **make_sizes("nominal", base, base.received)
+    )

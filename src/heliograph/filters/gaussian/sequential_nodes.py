@@ -1,0 +1,136 @@
+"""Central filter of several nodes: one prediction, then their measurements one after another."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import itemgetter
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.base import (
+    AbstractSizedFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    estimates,
+    make_sizes,
+    predicts,
+)
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian_prediction import smoother_step_by_transform
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.over_time import have_same_structure, stack
+from heliograph.model.premises.agreement import join_premises
+from heliograph.model.premises.premise import on_premise
+from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
+
+
+class SequentialFilter(AbstractSizedFilter):
+    """Predict with the first node's filter, then correct with each node's in turn; z is the nodes' measurements joined.
+
+    The posterior of one node is the prior of the next. Behind uncertain gains the first correction is not a conditional
+    mean, so a next one that assumes E[e yhat'] = 0 (`ZeroMean`) is no bound: the claim is "nominal" unless every part
+    is exact. The innovations are those of node after node, each given the nodes before it: the covariance has a block
+    for each, and the log-likelihood is their sum, which is that of all.
+    """
+
+    filters: tuple[GaussianFilter, ...]
+
+    def angles_used(self) -> FilterAngles:
+        """Return the angles of the plant, and those of all nodes' measurements, one after another."""
+        # First row of each node among all that is received, and then their number.
+        starts = np.cumsum([0, *(filter.received for filter in self.filters)])
+        parts = [filter.angles_used() for filter in self.filters]
+        received = [int(start) + i for start, part in zip(starts, parts, strict=False) for i in part.received]
+        return FilterAngles(parts[0].states, tuple(received))
+
+    @in_float64
+    def init(self) -> Gaussian:
+        """Return the first node's prior."""
+        return self.filters[0].init()
+
+    @predicts
+    def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
+        """Predict with the first node's filter."""
+        return self.filters[0].predict(state, u, k)
+
+    @corrects
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
+        """Correct with each node's measurement in turn; z: those of all nodes, one behind the other."""
+        z = jnp.asarray(z)
+        if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
+            return self._correct_in_one_loop(state, z, k)
+        # Filters of different structure: one correction each.
+        ends, innovations = np.cumsum([filter.received for filter in self.filters]), []
+        for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
+            state, innovation = filter.correct(state, received, k)
+            innovations.append(innovation)
+        return state, _join_innovations(innovations)
+
+    def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
+        """Correct as `correct` does, for filters of one structure: one correction compiled, run over the nodes."""
+        arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
+
+        def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
+            """Correct with one node's measurement."""
+            arrays_of_node, measurement = node
+            filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
+            return filter_of_node.correct(belief, measurement, k)
+
+        nodes = len(self.filters)
+        state, innovations = jax.lax.scan(correct, state, (arrays, z.reshape(nodes, -1)))
+        return state, _join_innovations([jax.tree.map(itemgetter(i), innovations) for i in range(nodes)])
+
+    @estimates
+    def estimate(self, state: Gaussian) -> Estimate:
+        """Return the mean and covariance of the belief, by the first node's filter."""
+        posterior = self.filters[0].estimate(state)
+        return Estimate(posterior.mean, posterior.covariance, self.claim)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step around all nodes' updates."""
+        return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
+
+
+def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
+    """Return one innovation of all nodes' measurements, from each node's given the nodes before it."""
+    covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
+    total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
+    return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)
+
+
+def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
+    """Return the central filter made of single nodes' `filters`, in the order of the network's nodes.
+
+    Claim: "exact" if every part is, else "nominal".
+
+    Args:
+        filters: one for each node, of one plant.
+
+    Raises:
+        ValueError: no filters, or filters of different state dimensions.
+
+    Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
+    """
+    nodes = tuple(items("sequential filter", filters, "filters"))
+    for filter in nodes:
+        instance("sequential filter", filter, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
+    # All estimate the same plant.
+    sizes = [(len(filter.states), len(filter.inputs)) for filter in nodes]
+    if len(set(sizes)) != 1:
+        raise fail("sequential filter", "filters of as many states and inputs each", sizes)
+    angles = {filter.angles_used().states for filter in nodes}
+    if len(angles) != 1:
+        raise fail("sequential filter", "filters of one plant, whose angles are the same states", sorted(angles))
+    # A bound of one node is none after another one's: anything below "exact" is "nominal".
+    claim: Claim = "exact" if weakest([filter.claim for filter in nodes]) == "exact" else "nominal"
+    central = SequentialFilter(filters=nodes, **make_sizes(claim, nodes[0], sum(filter.received for filter in nodes)))
+    # What the claim is about is known if it is of every node.
+    premises = [filter.premise for filter in nodes if filter.premise is not None]
+    return on_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)

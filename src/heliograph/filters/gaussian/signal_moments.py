@@ -1,0 +1,178 @@
+"""Moments of the signal that a sensor sends, and conditioning on what of it arrives: slopes in the state, and noise.
+
+Notation: the prior is x = m + L xi, xi uncorrelated with variances d; the sensor's signal is y = E y + slopes xi + v, v
+its noise and what of it is not linear in xi; z = G y + n is the measurement behind a channel, M = E[G].
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    eliminate,
+    join_columns,
+    rounding_of,
+    square_root,
+    unit_of,
+)
+from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
+from heliograph.factors.repeated import triangularise_noise
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, linear_image
+from heliograph.model.estimate import Innovation
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor, LinearSensor
+from heliograph.numerics.angle import Angles, continue_angles, wrap_near
+from heliograph.numerics.linalg import contract, diagonal
+from heliograph.numerics.types import Array
+from heliograph.random_affine.moments.second_moments import SecondOrder
+
+LOST = 100  # roundings of its variance, which elimination leaves of a combination free of a random gain
+
+
+class ArrivedInnovation(NamedTuple):
+    """Innovation z - E z (m,), and which components arrived (m,): an innovation may be NaN though its z arrived."""
+
+    innovation: jax.Array
+    present: jax.Array
+
+
+class Signal(NamedTuple):
+    """Moments of the sensor's signal y = E y + slopes xi + v under the prior x = m + L xi.
+
+    Shapes: mean (p,), slopes (p, n), noise (p, columns) of v, second = E[y y'] (p, p), size (p,), the second moments of
+    what y is computed from, of which the rounding stays unknown.
+    """
+
+    prior: Gaussian
+    mean: jax.Array
+    slopes: jax.Array
+    noise: WeightedColumns
+    second: jax.Array
+    size: jax.Array
+
+    @property
+    def covariance(self) -> jax.Array:
+        """Covariance Cov y (p, p) of the signal, with the sensor's noise."""
+        return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise).covariance
+
+    @property
+    def cross(self) -> jax.Array:
+        """Cross-covariance Cov(x, y) (n, p) of state and signal."""
+        return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
+
+    def about_mean(self) -> "Signal":
+        """Return the moments of y - E y: all that the update behind a known gain depends on, whatever was estimated."""
+        return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
+
+
+def find_signal_moments(
+    plant: AbstractPlant,
+    sensor: AbstractSensor,
+    transform: AbstractTransform,
+    prior: Gaussian,
+    start: jax.Array,
+    noise: WeightedColumns | None = None,
+) -> Signal:
+    """Return the moments of the sensor's signal y = h(x) + v under the prior of x.
+
+    Args:
+        plant: whose states may be angles.
+        sensor: h and the law of v.
+        transform: for an h that is not linear.
+        prior: the law of x.
+        start: E[x_i^2] before any data (n,), on which rounding acts.
+        noise: of v, in place of the sensor's.
+    """
+    law = sensor.noise
+    if isinstance(sensor, LinearSensor):
+        image = linear_image(sensor.matrix, sensor.measure(prior.mean), prior)
+    else:
+        measure = continue_angles(sensor.measure, prior.mean, plant.angles, sensor.angles)
+        image = transform.image(plant.manifold.chart(measure, prior.mean), prior)
+    mean, noise = image.mean + law.mean, join_columns(law.columns if noise is None else noise, image.curvature)
+    second = join_columns(image.explained, noise).covariance + jnp.outer(mean, mean)
+    size = bound_signal_power_at_start(sensor, start) if isinstance(sensor, LinearSensor) else diagonal(second)
+    return Signal(prior=prior, mean=mean, slopes=image.slopes, noise=noise, second=second, size=size)
+
+
+def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
+    """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
+
+    Rounding acts on numbers of this size. It is taken at the start, once: the present estimate would make covariances
+    of a linear filter depend on data, and E[x_i^2] before data grows without end where only inputs hold a plant.
+
+    Args:
+        sensor: H and the law of v.
+        start: E[x_i^2] of the n states at the start, before any data (n,).
+    """
+    law = sensor.noise
+    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
+    size: jax.Array = reach**2 + diagonal(law.covariance)
+    return size
+
+
+def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns:
+    """Return the noise of z given the state, under the nominal law: M v, n, the spread of the gain, and rounding.
+
+    The noises v and n are made triangular, so that a combination of outputs free of both is known to eps. What the
+    random gain adds, E[(G - M) y y' (G - M)'], is formed as a matrix and eliminated, which leaves a hundred eps in a
+    combination free of it.
+    """
+    return noise_behind_gain(signal, jnp.asarray(channel.mean_gain), channel.gain_spread, channel.noise)
+
+
+def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
+    """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
+    rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
+    plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
+    return join_columns(plain, factor_gain_noise(gain_spread, signal.second, signal.mean))
+
+
+def factor_gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
+    """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
+    return factor_spread(contract(gain_spread, augmented_second_moment(second, mean, 1.0)))
+
+
+def factor_spread(spread: jax.Array) -> WeightedColumns:
+    """Return factors of a covariance that was formed as a matrix; what is below a hundred eps of it counts as zero."""
+    return eliminate(spread, LOST * unit_of(spread))
+
+
+def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
+    """Return Cov z given a y with these moments, under the nominal law: n and the spread of the gain."""
+    return join_columns(channel.noise, factor_gain_noise(channel.gain_spread, second, mean))
+
+
+def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnovation) -> tuple[Gaussian, Innovations]:
+    """Condition the prior on what arrived behind the nominal law of the channel."""
+    slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
+    return condition_on_observation(signal.prior, slopes, z.innovation, make_received_noise(signal, channel), z.present)
+
+
+def condition_on_measurement(
+    x: Gaussian, slopes: jax.Array, noise: WeightedColumns, z: jax.Array, expected: jax.Array, angles: Angles = ()
+) -> tuple[Gaussian, Innovation]:
+    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
+    present = ~jnp.isnan(z)
+    z = wrap_near(z, expected, angles)
+    value = z - expected
+    after, innovations = condition_on_observation(x, slopes, value, noise, present)
+    total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
+    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+    return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
+
+
+def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
+    """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
+    slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
+    return join_columns(
+        WeightedColumns(slopes, signal.prior.variances), make_received_noise(signal, channel)
+    ).covariance
+
+
+def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
+    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
+    top = jnp.concatenate([second, mean[:, None]], axis=1)
+    return jnp.concatenate([top, jnp.append(mean, last)[None]])

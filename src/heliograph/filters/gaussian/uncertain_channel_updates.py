@@ -1,0 +1,286 @@
+"""Measurement updates behind an uncertain channel: the gain that minimises a bound on the error covariance.
+
+Notation inside: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n the measurement,
+M = E[G] nominal, D_v = E_v[G] - M the shift under a possible law v.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, condition_on_received
+from heliograph.filters.gaussian.uncertain_channel_bounds import (
+    Scalars,
+    condition_by_young_bound,
+    condition_by_zero_mean_bound,
+    keep_where_unchanged,
+    scalars_as_array,
+    scalars_from_array,
+)
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.law import Discrete
+from heliograph.random_affine.moments.moment_tensors import symmetric_product
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap
+from heliograph.random_affine.moments.second_moments import (
+    SecondOrder,
+    describe_second_moments,
+    nominal_spread,
+    second_order,
+)
+
+
+@readable
+class AbstractUpdate(Module):
+    """Rule for bounding the effect of a channel's uncertainty, with the gain that minimises the bound."""
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Return the channel's mean gain and its worst cases over the polytope of laws, once before any data."""
+        return second_order(channel)
+
+    def described(self) -> "AbstractUpdate":
+        """Return the update that corrects once the channel is described.
+
+        Updates that differ in the description alone share it, so that filters with one correction share a compiled
+        program.
+        """
+        return self
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the gain K (n, m) and bound (n, n) of the update; the columns of absent components are zero.
+
+        A rule of your own gives this; those of the library give `condition`, from which it follows.
+
+        Args:
+            prior: covariance (n, n) of the state before the update, `signal.prior`.
+            signal: moments of the sensor's signal y: `mean`, `covariance`, `cross` = Cov(x, y), `second` = E[y y'].
+            channel: what `describe` returned.
+            present: which components of z arrived (m,).
+        """
+        if type(self).condition is AbstractUpdate.condition:
+            raise unwritten(self, "correct")
+
+        def update(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
+            """Return the mean after an update with this innovation, whose derivative is the gain, and the posterior."""
+            z = ArrivedInnovation(innovation, present)
+            after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
+            return jnp.asarray(after.mean), after
+
+        gain, after = jax.jacfwd(update, has_aux=True)(jnp.zeros(len(present)))
+        return gain, jnp.asarray(after.covariance)
+
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
+        """Condition `signal.prior` on z - E z; by default from `correct`.
+
+        Args:
+            signal: moments of the sensor's signal.
+            channel: what `describe` returned.
+            z: z - E z, and what of it arrived.
+            nominal: the prior conditioned behind the nominal law, the best update of a law that is known.
+        """
+        prior = signal.prior
+        gain, bound = self.correct(prior.covariance, signal, channel, z.present)
+        after = from_covariance(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
+        return keep_where_unchanged(jnp.any(z.present), after, prior)
+
+    def claim(self, uncertain: bool) -> Claim:
+        """Return the claim of the bound behind a channel of this kind, of a filter for which all else is exact.
+
+        Args:
+            uncertain: whether probabilities of the channel are known up to a radius only.
+        """
+        return "nominal"
+
+
+class Polytope(AbstractUpdate):
+    """Bound by Young's inequality over the exact worst case of the uncertain probabilities.
+
+    e+ = e - K M e_y - K D_v y - K (zero mean given y) and, for every beta_1, beta_2 > 0,
+
+    E[e+ e+'] <= (1 + beta_1) P - K M Pyx - (.)' + K Omega K', with
+    Omega = spread(Y) + (1/beta_1 + 1/beta_2) shift(Y) + (1 + beta_2) M Pyy M'.
+
+    No assumption on E[e y'] beyond Pxy. Where the law is known shift = 0, both scalars are 0 and the bound is the
+    covariance itself.
+
+    Args:
+        scalars: beta_1 and beta_2; None, the default, minimises the trace over them at each step.
+
+    Source: cubature fusion under amplify-and-forward relays, Theorems 1 and 2, with the worst cases taken exactly.
+    """
+
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = scalars_as_array(scalars)
+
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
+        """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
+        return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
+
+    def claim(self, uncertain: bool) -> Claim:
+        """Return "upper" where the law is uncertain, else "exact"."""
+        return "upper" if uncertain else "exact"
+
+
+class ZeroMean(AbstractUpdate):
+    """Tighter value under the filter's premise E[e | data] = 0, hence E[e yhat'] = 0; no bound where that is not so.
+
+    Then only e_y, not all of y, is correlated with e:
+
+    E[e+ e+'] <= P + beta Pxy Pyy^-1 Pyx - K M Pyx - (.)' + K Omega K',
+    Omega = power(Pyy) + shift(Pyy) / beta + spread(yhat yhat').
+
+    The premise holds before the first correction alone: behind a law that is off, the estimate is biased given the data
+    from then on. So behind uncertain probabilities the claim is "nominal"; errors of four times it were found.
+
+    Args:
+        scalar: beta > 0; None, the default, minimises the trace over beta at each step.
+
+    Raises:
+        ValueError: a scalar that is not positive.
+    """
+
+    scalar: np.ndarray
+
+    def __init__(self, scalar: float | None = None):
+        self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
+        if np.any(self.scalar <= 0):
+            raise fail("scalar of the bound", "a positive number", scalar)
+
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
+        """Return `nominal` behind a known law; else minimise the trace over K, and over beta unless it is fixed."""
+        return condition_by_zero_mean_bound(signal, channel, z, self.scalar) if channel.uncertain else nominal
+
+    def claim(self, uncertain: bool) -> Claim:
+        """Return "nominal" where the law is uncertain, since E[e | data] is not 0 after a correction; else "exact"."""
+        return "nominal" if uncertain else "exact"
+
+
+class Interval(AbstractUpdate):
+    """Young's bound with each hop's uncertainty as intervals of its moments, combined hop by hop.
+
+    With m, s = E g, E g^2 and radii r = sum |v_i| radius_i, q = sum v_i^2 radius_i of each hop:
+    var g <= s + q - max(|m| - r, 0)^2. Sound, looser than `Polytope`, and for chains of scalar hops only.
+
+    Args:
+        scalars: beta_1 and beta_2 as in `Polytope`; None, the default, minimises the trace over them at each step.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (11), with the sign of its last term corrected.
+    """
+
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = scalars_as_array(scalars)
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Return the worst cases from intervals.
+
+        Raises:
+            ValueError: a channel that is not a chain of scalar hops.
+        """
+        return combine_hop_ranges(
+            channel, lambda hop: hop.largest_second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2
+        )
+
+    def described(self) -> AbstractUpdate:
+        """Return Young's bound, as for a polytope."""
+        return Polytope(scalars_from_array(self.scalars))
+
+    def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
+        """Return `nominal` behind a known law; else minimise the trace over K, and over the scalars unless fixed."""
+        return condition_by_young_bound(signal, channel, z, self.scalars) if channel.uncertain else nominal
+
+    def claim(self, uncertain: bool) -> Claim:
+        """Return "upper" where the law is uncertain."""
+        return "upper" if uncertain else "exact"
+
+
+class HopRange(NamedTuple):
+    """Range of one hop a g: amplitude a, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
+
+    amplitude: float
+    mean: float
+    mean_radius: float
+    largest_second: float
+    noise: np.ndarray
+
+
+def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
+    """Return the range of one hop's moments; raise if it is not one gain for all components, with zero-mean noise."""
+    if not isinstance(hop, GainAndNoise) or not _is_multiple_of_identity(hop.matrix) or np.any(hop.noise.mean):
+        raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
+    # Probabilities p_i within r_i: E g within sum |v_i| r_i of its nominal value, E g^2 at most sum v_i^2 r_i above.
+    law, mean_radius, second_radius = hop.law, 0.0, 0.0
+    if isinstance(law, Discrete):
+        mean_radius, second_radius = float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius)
+    return HopRange(
+        amplitude=float(hop.matrix[0, 0]),
+        mean=float(law.moment(1)),
+        mean_radius=mean_radius,
+        largest_second=float(law.moment(2)) + second_radius,
+        noise=np.asarray(hop.noise.covariance),
+    )
+
+
+def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
+    """Return whether the matrix is a number times the identity."""
+    return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
+
+
+def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
+    """Return the worst-case second moments of a chain of hops, from the range of possible moments of each hop's gain.
+
+    Each hop multiplies by a g and adds noise of covariance Q: amplitude a, gain g of mean m up to +-r, the largest
+    E g^2 being s. From V = 0, S = 1, N = 0, hop after hop: V <- var S + (|m| + r)^2 V bounds the variance of the
+    product of the gains g, S <- s S its power E (g_1 g_2 ...)^2, and N <- (a^2 s) N + Q the noise's covariance.
+
+    Args:
+        channel: a chain of hops, each one gain for all components and noise of zero mean.
+        variance: returns the bound `var` on the variance of a hop's g.
+    """
+    hops = [_describe_hop(hop) for hop in channel.in_series]
+    # The recursion over the hops.
+    spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
+    for hop in hops:
+        spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
+        power *= hop.largest_second
+        noise = hop.amplitude**2 * hop.largest_second * noise + hop.noise
+    # How far the mean of the product may lie from the nominal one: prod (|m| + r) - prod |m|.
+    amplitude = float(np.prod([hop.amplitude for hop in hops]))
+    nominal = float(np.prod([abs(hop.mean) for hop in hops]))
+    shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal
+    gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
+
+    def make_map(value: float, constant: np.ndarray) -> QuadraticMap:
+        """Return the map Y -> amplitude^2 value E[y y'] + constant of Y = E[(y, 1)(y, 1)'], of one gain for all of y.
+
+        As a tensor [i, j, a, b] its result is sum_ab center[i, j, a, b] Y[a, b]; the constant multiplies Y's last
+        corner, which is 1.
+        """
+        center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
+        center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))
+        center[..., -1, -1] = constant
+        return QuadraticMap(center, np.zeros_like(center))
+
+    # The gain's deviation from the nominal mean has a mean, at most `shift`, and a variance about it: together
+    # the second moment shift^2 + spread, beside that of the noise n. The power E[G y y' G'] is the signal's alone.
+    zero = np.zeros_like(noise)
+    return describe_second_moments(
+        mean=np.concatenate([gain, np.zeros((len(noise), 1))], axis=1),
+        spread=make_map(spread + shift**2, noise),
+        shift=make_map(shift**2, zero),
+        power=make_map(power, zero),
+        nominal=nominal_spread(channel),
+        uncertain=shift > 0,
+    )

@@ -1,0 +1,288 @@
+"""Linear filters whose gains and covariances are computed for each step before any data; only the mean is left."""
+
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.engine.choice import compute_once
+from heliograph.engine.size_thresholds import SHORT
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, with_gaussian
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import array
+from heliograph.numerics.float64 import in_float64, quickly_compiled
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+
+class LinearStep(NamedTuple):
+    """One step of a linear filter: m- = F m + f, m = m- + K (z - C m- - c), with innovation covariance S.
+
+    Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m); of
+    several filters with a leading axis.
+    """
+
+    transition: jax.Array
+    drift: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    offset: jax.Array
+    innovation: jax.Array
+
+    def predict(self, mean: Float[Array, " N"]) -> Float[jax.Array, " N"]:
+        """Return m- = F m + f."""
+        return jnp.asarray(self.transition @ mean + self.drift)
+
+    def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:
+        """Predict the measurement, C m- + c, from the predicted mean m-."""
+        return jnp.asarray(self.output @ mean + self.offset)
+
+    def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
+        """Return m = m- + K e."""
+        return jnp.asarray(mean + self.gain @ innovation)
+
+    def error_transition(self) -> Float[jax.Array, "*node N N"]:
+        """Return I - K C, which maps the predicted mean, and its error, to the corrected one."""
+        return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
+
+
+class PlannedMean(NamedTuple):
+    """Mean (N,), and the index of its covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k."""
+
+    mean: Float[jax.Array, " N"]
+    stage: Int[jax.Array, ""]
+
+
+class PlannedFilter(AbstractSizedFilter):
+    """A filter whose gains and covariances are known for each step; only the mean is left to compute.
+
+    Valid for the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built
+    by `planned` of a filter whose gains do not depend on data.
+
+    `past`: the smoother steps without their data; None if the filter is not smoothed.
+
+    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); projection (n, N), with
+    xhat = projection m.
+    """
+
+    steps: OverTime
+    covariances: Array
+    start: Array
+    projection: Array | None
+    past: OverTime | None = None
+
+    @property
+    def is_linear(self) -> bool:
+        """True unless the plant's state is a projection of its mean."""
+        return self.projection is None
+
+    @in_float64
+    def init(self) -> PlannedMean:
+        """Return the initial mean."""
+        return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
+
+    @predicts
+    def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
+        """Return F m + f; the input is in f."""
+        step: LinearStep = at(self.steps, k)
+        return PlannedMean(step.predict(state.mean), _convert_stage(state, 2 * k + 1))
+
+    @corrects
+    def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
+        """Return m + K (z - C m - c)."""
+        step: LinearStep = at(self.steps, k)
+        z, expected = jnp.asarray(z), step.expect(state.mean)
+        mean = step.correct(state.mean, z - expected)
+        return PlannedMean(mean, _convert_stage(state, 2 * k + 2)), gaussian_innovation(z, expected, step.innovation)
+
+    @estimates
+    def estimate(self, state: PlannedMean) -> Estimate:
+        """Return the mean of the state, with the planned covariance."""
+        return self._estimate(state.mean, state.stage)
+
+    def after_step(self, state: PlannedMean, k: Step) -> Estimate:
+        """Return the mean of the state, with the planned covariance of step k, common to all runs."""
+        return self._estimate(state.mean, 2 * k + 2)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the planned smoother step with the means of these data."""
+        if self.past is None:
+            return super().smoother_step(step)
+        planned = cast(SmootherStep, at(self.past, step.k))
+        return planned.with_data(*(jnp.asarray(state.mean) for state in (step.before, step.prior, step.after)))
+
+    def with_past(self, steps: SmootherStep) -> AbstractFilter:
+        """Return the filter with smoother steps, which are the same for all data."""
+        return replace(self, past=OverTime(steps))
+
+    def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
+        """Return the estimate of the plant's state, with the covariance of this stage."""
+        x = mean if self.projection is None else self.projection @ mean
+        return Estimate(x, jnp.asarray(self.covariances)[stage], self.claim)
+
+
+def _convert_stage(state: PlannedMean, stage: Step) -> jax.Array:
+    """Return a stage in the integer type that the state has."""
+    return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
+
+
+def plan_filter(
+    filter: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
+) -> PlannedFilter:
+    """Return a filter with its matrices recorded for these inputs and complete data.
+
+    Its state is a Gaussian, or holds one. Only the mean may depend on data, and affinely: then F, K and C are
+    derivatives, the same at every mean. `projection` (n, N) maps the filter's mean to the plant's states.
+    """
+    arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
+    if is_traced(arguments):
+        return _record_matrices(*arguments)
+    return cast(PlannedFilter, compute_once(_record_matrices, _plan_by_xla, arguments, SHORT))
+
+
+def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+    """Return the filter with its gains and covariances of every step, recorded while it runs over data of zeros.
+
+    Args:
+        filter: one of which only the mean depends on data.
+        inputs: of each step (steps, inputs).
+        projection: (n, N), maps the filter's mean and covariance to those of the plant's state; None where they are
+            these already.
+    """
+    # Complete data of zeros: the matrices do not depend on their values.
+    zeros = jnp.zeros(filter.received)
+
+    def record_step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
+        """Step the filter; the output is the step's matrices, and the covariances before and after correction."""
+        k, u = row
+        step, prior, after = record_step_matrices(filter, state, zeros, u, k)
+        covariances = jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)])
+        return after, (step, covariances)
+
+    start = filter.init()
+    start = jax.tree.map(jnp.asarray, start)
+    _, (steps, covariances) = jax.lax.scan(record_step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
+    # Covariances in the order of `PlannedMean.stage`: at the start, then before and after correction of each step.
+    in_order = covariances.reshape(-1, *covariances.shape[2:])
+    by_stage = jnp.concatenate([_project_covariance(start, projection)[None], in_order])
+    return PlannedFilter(
+        steps=OverTime(steps),
+        covariances=by_stage,
+        start=gaussian_of(start).mean,
+        projection=projection,
+        **make_sizes(filter.claim, filter, filter.received),
+    )
+
+
+_plan_by_xla = quickly_compiled(_record_matrices)
+
+
+def record_step_matrices(
+    filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step
+) -> tuple[LinearStep, PyTree, PyTree]:
+    """Return the matrices of step k, the state after its prediction, and that after its correction.
+
+    Args:
+        filter: one of which only the mean depends on data, and affinely.
+        state: before the step; the matrices are the same whatever its mean, and the states returned are from mean 0.
+        z: measurement (m,), which says by NaN what did not arrive.
+        u: input.
+        k: number of the step.
+    """
+    # F and f: the prior mean is affine in the mean, so that f is its value and F its derivative at 0.
+    zero_mean = jnp.zeros_like(gaussian_of(state).mean)
+
+    def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
+        """Return the predicted mean, and the predicted state."""
+        prior = filter.predict(_with_mean(state, mean), u, k)
+        return jnp.asarray(gaussian_of(prior).mean), prior
+
+    transition, prior = jax.jacfwd(predict, has_aux=True)(zero_mean)
+    # K: derivative of the posterior mean by z; -C: derivative of the innovation by the prior mean; -c: its value at 0.
+    (_, gain), (output, _), after, innovation = _correction_slopes(filter, prior, zero_mean, z, k)
+    step = LinearStep(
+        transition=transition,
+        drift=jnp.asarray(gaussian_of(prior).mean),
+        gain=gain,
+        output=-output,
+        offset=-jnp.asarray(innovation.value),
+        innovation=jnp.asarray(innovation.covariance),
+    )
+    return step, prior, after
+
+
+def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
+    """Return a filter's state with another mean."""
+    return with_gaussian(state, gaussian_of(state)._replace(mean=mean))
+
+
+def _correction_slopes(
+    filter: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
+    """Return derivatives of the corrected mean, and of the innovation, each by (prior mean, z), and both themselves."""
+
+    def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
+        """Return corrected mean and innovation, and the objects that hold them."""
+        after, innovation = filter.correct(_with_mean(prior, mean), z, k)
+        return (jnp.asarray(gaussian_of(after).mean), jnp.asarray(innovation.value)), (after, innovation)
+
+    (mean_slopes, innovation_slopes), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    return mean_slopes, innovation_slopes, after, received
+
+
+def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearStep:
+    """Return the matrices of one step of a filter of which only the mean depends on data; z says what arrived.
+
+    Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
+    """
+    if isinstance(filter, PlannedFilter):
+        outcome: LinearStep = at(filter.steps, k)
+        return outcome
+    step, _, _ = record_step_matrices(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    present = ~jnp.isnan(z)
+    return step._replace(
+        gain=jnp.where(present, step.gain, 0.0),
+        output=jnp.where(present[:, None], step.output, 0.0),
+        offset=jnp.where(present, step.offset, 0.0),
+    )
+
+
+class LinearisedStep(NamedTuple):
+    """One step of a filter linearised at its estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
+
+    Shapes: predicted m- (n,), gain K (n, m), output C (m, n), noise S (m, m); zero for what did not arrive.
+    """
+
+    predicted: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    noise: jax.Array
+
+
+def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> LinearisedStep:
+    """Linearise a filter's correction at its prediction, with its covariance held.
+
+    The filter's state is a Gaussian, or holds one. S = Cov(innovation) - C P C', for its predicted P.
+    """
+    prior = filter.predict(state, u, k)
+    x = gaussian_of(prior)
+    (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(x.mean), z, k)
+    present = ~jnp.isnan(z)
+    output = jnp.where(present[:, None], -output, 0.0)
+    total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
+    return LinearisedStep(
+        predicted=x.mean,
+        gain=jnp.where(present, gain, 0.0),
+        output=output,
+        noise=total - output @ x.covariance @ output.T,
+    )
+
+
+def _project_covariance(state: PyTree, projection: Array | None) -> jax.Array:
+    """Return the covariance of the plant's state, by the projection if there is one."""
+    covariance = jnp.asarray(gaussian_of(state).covariance)
+    return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

@@ -1,0 +1,263 @@
+"""Filters with gains computed before any data, and the same recursion on-line for data with gaps."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    factor_covariances,
+    join_columns,
+    rounding_of,
+    triangularise,
+)
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, predict_affine
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.precomputed_filter import plan_filter
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import instance, names
+from heliograph.numerics.float64 import compile_in_float64, in_float64
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+
+
+class ScheduleState(NamedTuple):
+    """Schedule's state (N,), the estimate's mean (q,), the expected measurement (m,), and whether all has arrived.
+
+    `stage` is the index of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
+    """
+
+    value: Float[jax.Array, " N"]
+    mean: Float[jax.Array, " q"]
+    expected: Float[jax.Array, " m"]
+    complete: Bool[jax.Array, ""]
+    stage: Int[jax.Array, ""]
+
+
+class ScheduledFilter(AbstractSizedFilter):
+    """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d, a few products of a matrix and a vector per step.
+
+    The prediction assumes that the expected measurement arrives, e = G s + g; a correction adds K (z - e) and J (z -
+    e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not arrive
+    counts as if it equalled its expectation, and from then on the covariance is NaN: it is not known any more, and the
+    record says so; a component with zero gain cannot be missed (a planned silence). Where data have gaps, use
+    `LinearSystemFilter`, which recomputes its gains. Before its first prediction a schedule estimates nothing (NaN).
+
+    Args:
+        schedule: gains and covariances for each step.
+        states: names of the states; x0, x1, ... by default.
+
+    Shapes: covariances (2 horizon + 1, q, q), before and after each correction; unused (horizon, m), components of no
+    gain.
+    """
+
+    gains: OverTime
+    unused: np.ndarray
+    covariances: np.ndarray
+    start: np.ndarray
+
+    def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
+        instance("schedule", schedule, Schedule, "a Schedule")
+        g = schedule.gains
+        self.gains = OverTime(_gains_for_expected_measurement(g))
+        self.unused = np.all(g.gain == 0, axis=1) & np.all(g.direct == 0, axis=1)
+        known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
+        self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
+        self.start, self.claim = schedule.start, schedule.claim
+        self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
+        self.received, self.kept = g.direct.shape[2], schedule.kept
+
+    @compile_on_call
+    def init(self) -> ScheduleState:
+        """Return the schedule's initial state."""
+        mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
+        return ScheduleState(
+            value=jnp.asarray(self.start),
+            mean=mean,
+            expected=expected,
+            complete=jnp.asarray(True),
+            stage=jnp.asarray(0),
+        )
+
+    @predicts
+    def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
+        """Predict as if the expected measurement arrived."""
+        g: Gains = at(self.gains, k)
+        s = state.value
+        return ScheduleState(
+            value=g.transition @ s + g.offset,
+            mean=g.output @ s + g.output_offset,
+            expected=g.expected @ s + g.expected_offset,
+            complete=state.complete,
+            stage=jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
+        )
+
+    @corrects
+    def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
+        """Add the innovation times the gains of step k."""
+        g: Gains = at(self.gains, k)
+        z = jnp.asarray(z)
+        present = ~jnp.isnan(z)
+        innovation = jnp.where(present, z - state.expected, 0.0)
+        after = ScheduleState(
+            value=state.value + g.gain @ innovation,
+            mean=state.mean + g.direct @ innovation,
+            expected=state.expected,
+            complete=state.complete & jnp.all(present | jnp.asarray(self.unused)[k]),
+            stage=jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
+        )
+        return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
+
+    @estimates
+    def estimate(self, state: ScheduleState) -> Estimate:
+        """Return the mean of the estimate, with the schedule's covariance while all has arrived."""
+        return self._estimate(state, state.stage)
+
+    def after_step(self, state: ScheduleState, k: Step) -> Estimate:
+        """Return the estimate after step k, with the covariance of that step, common to all runs."""
+        return self._estimate(state, 2 * k + 2)
+
+    def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
+        """Return the mean, with the covariance of this stage while all has arrived."""
+        claimed = jnp.where(state.complete, jnp.asarray(self.covariances)[stage], jnp.nan)
+        return Estimate(state.mean, claimed, self.claim)
+
+
+def _gains_for_expected_measurement(g: Gains) -> Gains:
+    """Return the gains of a step without data: e = G s + g for z in s+ = F s + K z + c and xhat = L s + J z + d."""
+    return g._replace(
+        transition=g.transition + g.gain @ g.expected,
+        offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
+        output=g.output + g.direct @ g.expected,
+        output_offset=g.output_offset + np.einsum("tim,tm->ti", g.direct, g.expected_offset),
+    )
+
+
+class LinearSystemFilter(AbstractSizedFilter):
+    """The best linear filter of a linear system, with its covariance propagated: exact also for data with gaps.
+
+    A component of z that did not arrive is left out of the step, as if that channel were off. Which components arrive
+    must not depend on their values.
+
+    Args:
+        system: matrices and noise covariances of each step.
+        claim: what the covariance is; "exact" by default.
+        states: names of the states; x0, x1, ... by default.
+    """
+
+    steps: OverTime
+    noises: OverTime
+    mean: np.ndarray
+    covariance: np.ndarray
+    projection: np.ndarray
+
+    def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
+        instance("system", system, LinearSystem, "a LinearSystem")
+        self.steps, self.noises = OverTime(system.steps), OverTime(_factor_noises(system))
+        self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
+        self.claim, self.inputs = claim, ()
+        self.states = names("state names", states, len(system.projection), "x")
+        self.received, self.kept = system.steps.offset.shape[-1], system.kept
+
+    @in_float64
+    def init(self) -> Gaussian:
+        """Return the system's initial belief."""
+        return from_covariance(self.mean, self.covariance)
+
+    @predicts
+    def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
+        """Return A y + a and A P A' + Cov(w)."""
+        s: Steps = at(self.steps, k)
+        return predict_affine(state, s.transition, s.drift, at(self.noises, k).process)
+
+    @corrects
+    def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
+        """Correct with the components of z that arrived."""
+        s: Steps = at(self.steps, k)
+        z, noise = jnp.asarray(z), at(self.noises, k).measurement
+        expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
+        return condition_on_measurement(state, slopes, noise, z, expected)
+
+    @estimates
+    def estimate(self, state: Gaussian) -> Estimate:
+        """Return the mean and covariance of the plant's states, by the projection."""
+        projection = jnp.asarray(self.projection)
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the law of the system's state before the step given its prediction."""
+        moved = at(self.steps, step.k).transition @ step.before.root, at(self.noises, step.k).process
+        return smoother_step_of(step, moved, self.claim, projection=self.projection)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """Precompute all covariances and gains."""
+        return plan_filter(self, inputs, self.projection)
+
+
+class SystemNoises(NamedTuple):
+    """Factors of both noises of a step, with the rounding of the state and of the measurement."""
+
+    process: WeightedColumns
+    measurement: WeightedColumns
+
+
+@in_float64
+def _factor_noises(system: LinearSystem) -> SystemNoises:
+    """Return the factors of both noises at each step, with the rounding of numbers as large as the system makes them.
+
+    A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
+    else one that repeats another would measure, without noise, the state times what rounding left of their difference.
+    """
+    s = system.steps
+    of_states, of_received = _second_moments_of_steps(system)
+
+    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> WeightedColumns:
+        """Return the factors of noises (time, n, n), with the rounding of numbers of second moments (time, n)."""
+        rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
+        return _factor_with_rounding(factor_covariances(covariances), rounding, lost)
+
+    process = factor(np.asarray(s.process), of_states, np.zeros(of_states.shape))
+    return SystemNoises(process, factor(np.asarray(s.noise), of_received, system.received_rounding))
+
+
+@compile_in_float64
+def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -> WeightedColumns:
+    """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
+
+    Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
+    """
+
+    def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:
+        """Return the factors of one step."""
+        return triangularise(join_columns(noise, rounding_of(seconds), WeightedColumns(np.eye(len(lost)), lost)))
+
+    factor_steps: Callable[..., WeightedColumns] = jax.vmap(factor_step)
+    return factor_steps(noise, seconds, lost)
+
+
+def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Return (|A| root E[y_i^2] + |a|)^2 of each next state (time, N), and the same of what is received (time, m).
+
+    They are the sizes of what is summed, for its rounding. By the moments before any data, since parts of a system that
+    start at zero do not stay there; limited to numbers whose squares are finite.
+    """
+    s, mean, covariance = system.steps, system.mean, system.covariance
+    largest = float(np.finfo(float).max) ** 0.5  # of a second moment; of a mean its root
+    of_states, of_received = [], []
+    for k in range(len(s.transition)):
+        reach = np.sqrt(mean**2 + np.diagonal(covariance))
+        of_states.append(np.minimum(np.abs(s.transition[k]) @ reach + np.abs(s.drift[k]), largest**0.5) ** 2)
+        mean = np.clip(s.transition[k] @ mean + s.drift[k], -(largest**0.5), largest**0.5)
+        covariance = s.transition[k] @ covariance @ s.transition[k].T + s.process[k]
+        covariance = np.clip(covariance, -largest, largest)
+        reach = np.sqrt(mean**2 + np.diagonal(covariance))
+        of_received.append(np.minimum(np.abs(s.output[k]) @ reach + np.abs(s.offset[k]), largest**0.5) ** 2)
+    return np.stack(of_states), np.stack(of_received)

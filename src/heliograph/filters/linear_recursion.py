@@ -1,0 +1,100 @@
+"""Recursion of linear filters over the rows of a recording, of whose states data change the means alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.gaussians_in_states import gaussians_of, select_state
+from heliograph.numerics.module import Module, unwritten
+from heliograph.numerics.types import Array, PyTree
+
+
+class Recursion(Module):
+    """Recursion of a linear filter over rows (z, u): data change only the means of the Gaussians in its state."""
+
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Return the state after row k, and what is kept of the row."""
+        raise unwritten(self, "step")
+
+    def predict(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> PyTree:
+        """Return the state after row k where none of its data arrived."""
+        missing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), row[0])
+        return self.step(state, (missing, row[1]), k)[0]
+
+
+class FilterRecursion(Recursion):
+    """Recursion of one filter, that puts out output(filter, state, innovation, k) of a row; `begin` is the first k."""
+
+    filter: Any
+    output: Callable[..., PyTree] = eqx.field(static=True)
+    begin: Array = eqx.field(default_factory=lambda: np.asarray(0))
+
+    def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Predict and correct."""
+        (z, u), number = row, self.begin + k
+        after, innovation = self.filter.correct(self.filter.predict(state, u, number), z, number)
+        return after, self.output(self.filter, after, innovation, number)
+
+
+def initial_state_if_linear(filter: Any) -> PyTree | None:
+    """Return the initial state of a linear filter; None where more than the mean of its state depends on data."""
+    start = jax.tree.map(np.asarray, filter.init()) if getattr(filter, "is_linear", False) else ()
+    return start if gaussians_of(start) else None
+
+
+def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
+    """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays."""
+
+    def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
+        """Step over one row."""
+        data, k = row
+        after, output = recursion.step(state, data, k)
+        return select_state(k < count, after, state), output
+
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))
+
+
+def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
+    """Scan rows as `scan_chunk` does, and return the sums over rows of what is kept of each."""
+
+    def step(state: PyTree, data: PyTree, k: Array) -> tuple[PyTree, PyTree]:
+        """Step over row k; return the state after it and what is kept of it."""
+        return recursion.step(state, data, k)
+
+    return sum_rows(step, jax.tree.map(jnp.asarray, state), rows, first, count)
+
+
+def sum_rows(
+    step: Callable[..., tuple[PyTree, PyTree]], state: PyTree, rows: PyTree, first: Array, count: Array
+) -> tuple[PyTree, PyTree]:
+    """Step over rows from number `first` on, before row `count`: the last state, and the sums of what steps return."""
+
+    def body(now: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
+        """Step over one row and add its output; from row `count` on nothing changes."""
+        (state, sums), (data, k) = now, row
+        after, output = step(state, data, k)
+        return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None
+
+    numbers = make_row_numbers(rows, first)
+    shapes = jax.eval_shape(lambda: step(state, jax.tree.map(lambda leaf: leaf[0], rows), numbers[0])[1])
+    zero_sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return jax.lax.scan(body, (state, zero_sums), (rows, numbers))[0]
+
+
+def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: Array) -> PyTree:
+    """Return the state after some rows, of which the first has the number `first`, and nothing of the rows."""
+
+    def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
+        """Step over one row."""
+        return recursion.step(state, *row)[0], None
+
+    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))[0]
+
+
+def make_row_numbers(rows: PyTree, first: Array) -> Array:
+    """Return the numbers of rows, from `first` on."""
+    return first + jnp.arange(len(jax.tree.leaves(rows)[0]))

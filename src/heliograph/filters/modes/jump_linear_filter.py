@@ -1,0 +1,391 @@
+"""Best linear filter of jump systems: it estimates the state jointly with the mode of links, plant and sensor.
+
+With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its transition and its measurement are linear and their
+noises white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~_j zeta^j,
+so that a Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1),
+c = E[x] before data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
+
+The covariance of zeta is carried by factors; the moments before any data, which no measurement diminishes, are plain
+matrices.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    below_diagonal,
+    join_columns,
+    rounding_of,
+    side_by_side,
+    triangularise,
+)
+from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, make_sizes, predicts
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.signal_moments import condition_on_measurement, factor_spread
+from heliograph.filters.linear.precomputed_filter import plan_filter
+from heliograph.filters.modes.linear_by_mode import (
+    MotionByMode,
+    centred_motion,
+    centred_sensing,
+    noise_by_mode,
+    noise_in_mode,
+    pad_with_zeros,
+)
+from heliograph.filters.modes.models_by_mode import find_models
+from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.modes_of_motion import models_of
+from heliograph.model.over_time import OverTime, at, first, restack, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.linalg import outer
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import stack_parts
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
+from heliograph.random_affine.memories_of_channels import drop_names
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
+
+
+class ChannelByMode(Module):
+    """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
+
+    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
+    gain_spread and noise: as in `SecondOrder`, for each mode.
+
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_spread (M, m, m, p + 1, p + 1), noise (M, m, m).
+    """
+
+    transition: Float[Array, "M M"]
+    radius: Float[Array, "M M"]
+    mean: Float[Array, "M m p1"]
+    gain_spread: Float[Array, "M m m p1 p1"]
+    noise: WeightedColumns
+
+    @property
+    def spread(self) -> Float[Array, "M m m p1 p1"]:
+        """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
+        spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
+        return spread
+
+
+class ModalBelief(NamedTuple):
+    """zeta, mode by mode, given the data, and E[x~ x~' 1{mode}] before any data.
+
+    centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is true
+    from the first prediction on.
+
+    Shapes: zeta (M (n + 1),), moments (M, n + 1, n + 1), centre (n,).
+    """
+
+    gaussian: Gaussian
+    moments: Float[jax.Array, "M n1 n1"]
+    centre: Float[jax.Array, " n"]
+    moved: Bool[jax.Array, ""]
+
+    @property
+    def law(self) -> jax.Array:
+        """Probabilities of the modes before any data (M,)."""
+        return self.moments[:, -1, -1]
+
+
+class MeasurementModel(NamedTuple):
+    """Model of a measurement of zeta: z = common + H zeta + noise.
+
+    Shapes: matrix H (m, N), common (m,), noise (m, columns).
+    """
+
+    matrix: jax.Array
+    common: jax.Array
+    noise: WeightedColumns
+
+
+class AbstractModalFilter(AbstractSizedFilter):
+    """Linear filter of x~ times functions of the modes of links with memory: its state estimates these products."""
+
+    plant: AnyPlant
+    sensor: AnySensor
+
+    @estimates
+    def estimate(self, state: PyTree) -> Estimate:
+        """Return x, a projection of zeta, and the covariance of its error."""
+        projection, x = self._projection_to_state(), state.gaussian
+        return Estimate(projection @ x.mean, WeightedColumns(projection @ x.root, x.variances).covariance, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """Precompute all covariances and gains."""
+        return plan_filter(self, inputs, self._projection_to_state())
+
+    def process_noise_by_mode(self, u: ArrayLike, k: Step, of_mode: WeightedColumns) -> WeightedColumns:
+        """Return columns of zeta's process noise and rounding, from `of_mode` = E[phi phi'] of the next functions."""
+        parts = noise_in_mode(at(self.plant, k), u, second_moments_at_start(self.plant))
+        return WeightedColumns(kron(of_mode.matrix, parts.matrix), outer(of_mode.weights, parts.weights).reshape(-1))
+
+    @abstractmethod
+    def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
+        """Return the matrix (n, N) that maps zeta to x."""
+
+
+class AbstractJointModalFilter(AbstractModalFilter):
+    """Linear filter of the state jointly with the mode of all links together."""
+
+    channel: ChannelByMode | OverTime
+    initial: Float[Array, " M"]
+
+    def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
+        """Return x = sum_j zeta^j."""
+        return make_mode_sum_matrix(len(self.states), len(self.initial))
+
+
+class ModalFilter(AbstractJointModalFilter):
+    """The linear minimum-mean-square-error filter of a linear system whose plant, sensor and links have modes.
+
+    The mode of a step moves the plant and measures in it. The estimate of zeta includes the modes' indicators, which
+    are linear estimates and no probabilities; its covariance is singular, since they sum to 1, which its factors take
+    as it is. Which components arrive must not depend on the modes. The innovation covariance is exact; the innovation
+    is not Gaussian, so its Gaussian likelihood is nominal.
+
+    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994),
+    whose plant moves with the mode before.
+    """
+
+    plant_modes: tuple[int, ...] = eqx.field(static=True)  # which of the plant's models each mode has
+    sensor_modes: tuple[int, ...] = eqx.field(static=True)
+
+    @compile_on_call
+    def init(self) -> ModalBelief:
+        """Return the prior, independent of the mode."""
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        prior, second = compute_initial_moments(start, self.initial)
+        moments, centre = law[:, None, None] * second, jnp.asarray(start.initial_mean)
+        return ModalBelief(gaussian=prior, moments=moments, centre=centre, moved=jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
+        """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
+
+        Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
+        """
+        rows = self._transition_matrix(state, k)
+        arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
+        law = arriving[:, -1, -1]
+        # F zeta about the moving centre.
+        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
+        mean = predict_by_mode(centred[:, None], motion.moves, rows)[:, 0] + mean_from_centre(law, motion.centre)
+        root, noise = self._transition_factors(state, u, k)
+        after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise))
+        moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
+        return ModalBelief(gaussian=after, moments=moments, centre=motion.centre, moved=jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
+        """Correct with the components of z that arrived.
+
+        Cov(z - E[z | zeta]) = sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j), T_j the
+        spread of the gains in mode j.
+        """
+        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
+        after, innovation = condition_modes_on_received(state.gaussian, centred, self._measurement_model(state, k), z)
+        return state._replace(gaussian=after), innovation
+
+    def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
+        """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
+        return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
+
+    def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
+        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
+        rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
+        # What the chain draws moves in its mode.
+        among = mode_transition_covariance(state.moments, rows)
+        parts = among.matrix.reshape(*moves.shape[:2], -1)
+        drawn = WeightedColumns((moves @ parts).reshape(among.matrix.shape), among.weights)
+        start = second_moments_at_start(self.plant)
+        of_process = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
+        return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, of_process)
+
+    def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
+        """Return the laws of motion of a step."""
+        return models_of(at(self.plant, k))
+
+    def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
+        """Return how the state moves about its centre in each mode of the step."""
+        arriving = mix_moments_of_modes(self._transition_matrix(state, k), state.moments)
+        return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
+
+    def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
+        """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
+        channel, sensors, law = at(self.channel, k), models_of(at(self.sensor, k)), state.law
+        measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
+        gains = jnp.asarray(channel.mean)
+        matrix, common = subtract_mean_output(gains @ measure, law)
+        # E[y~ y~' 1{mode j}] of what is sent (M, p + 1, p + 1), and the spread of the gains on it (m, m).
+        sent = propagate_by_mode(measure, state.moments, law[:, None, None] * noise)
+        gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
+        # Noise of sensor and links, in the mean over the modes, and rounding.
+        plain = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
+        rounding = rounding_of_received(gains, sent)
+        return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...).
+
+        `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
+        """
+        slopes, noise = self._transition_factors(step.before, step.u, step.k)
+        moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
+        return smoother_step_of(step, moved, self.claim, projection=projection)
+
+
+def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> jax.Array:
+    """Multiply columns (N, c) by F, F[j, i] = Pi[i, j] A~_j: mix all parts by the chain, then move each."""
+    parts = (rows.T @ columns.reshape(len(rows), -1)).reshape(rows.shape[1], moves.shape[-1], -1)
+    return jnp.reshape(moves @ parts, columns.shape)
+
+
+def mode_transition_covariance(moments: jax.Array, rows: jax.Array) -> WeightedColumns:
+    """Return columns of sum_i Cov(1{next} | i) x E_i (N, N), what the chain draws, from the moments E_i (M, s, s)."""
+    return factor_with_last_mode(jnp.einsum("ijl,iab->jalb", covariance_of_mode(rows)[:, :-1, :-1], moments))
+
+
+def covariance_of_mode(rows: jax.Array) -> jax.Array:
+    """Return Cov(1{j}, 1{l} | i) = delta_jl Pi_ij - Pi_ij Pi_il, (M, M, M)."""
+    return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
+
+
+def factor_with_last_mode(among: jax.Array) -> WeightedColumns:
+    """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
+
+    `among` (M - 1, s, M - 1, s): the covariance of all modes but the last, whose part is minus the sum of theirs.
+    """
+    others, size = among.shape[:2]
+    factors = factor_spread(among.reshape(others * size, others * size))
+    return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
+
+
+def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
+    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
+    gains = jnp.asarray(channel.mean)[:, :, :-1]
+    received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
+    return join_columns(*received, side_by_side(channel.noise, law))
+
+
+def rounding_of_received(gains: jax.Array, sent: jax.Array) -> WeightedColumns:
+    """Return the rounding (m, m) of z, of gains (M, m, p + 1), from E[y~ y~' 1{mode}] (M, p + 1, p + 1)."""
+    return rounding_of(jnp.einsum("jma,jab,jmb->m", gains, sent, gains))
+
+
+def kron(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return A x B, by a matrix product, which keeps known zeros."""
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
+    return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
+
+
+def make_mode_sum_matrix(n: int, modes: int) -> Float[np.ndarray, "n N"]:
+    """Return the matrix (n, N) that maps zeta to x = sum_j zeta^j."""
+    return np.tile(np.eye(n, n + 1), (1, modes))
+
+
+def condition_modes_on_received(
+    x: Gaussian, centred: jax.Array, output: MeasurementModel, z: ArrayLike
+) -> tuple[Gaussian, Innovation]:
+    """Return zeta, the state times the indicator of each mode, given the components of z that arrived; the innovation.
+
+    `centred`: the mean of zeta less P(mode) c, c the centre. `output`: z = common + matrix zeta + noise.
+    """
+    expected = output.common + output.matrix @ centred
+    return condition_on_measurement(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
+
+
+def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
+    """Return the law of zeta at the start, and E[x~ x~'].
+
+    Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
+    """
+    spread, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    state = from_covariance(start.initial_mean, start.initial_covariance)
+    mode = factor_with_last_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
+    # Factors of both, x before the indicator in each part.
+    last = np.zeros((len(spread), len(spread)))
+    last[-1, -1] = 1.0
+    ends = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
+    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(ends, last)
+    variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
+    prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
+    return prior, spread + last
+
+
+def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
+    """Return P(mode) c, mode after mode: the part of E zeta that the centre makes."""
+    return jnp.kron(law, jnp.append(centre, 0.0))
+
+
+def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Subtract the mean output over the modes, as the indicators sum to 1; return what is left and the mean output.
+
+    Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
+    """
+    common = law @ output[:, :, -1] / jnp.sum(law)
+    return output.at[:, :, -1].add(-common), common
+
+
+def concatenate_modes(output: jax.Array) -> jax.Array:
+    """Concatenate output matrices (M, m, n + 1) to one matrix (m, N) that acts on zeta."""
+    return jnp.concatenate(list(output), axis=1)
+
+
+def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
+    """Return the best linear filter where links, plant or sensor have modes; `linear_filter` has checked the parts."""
+    models = first(plant), first(sensor)
+    # The plant's and the sensor's model in each joint mode.
+    by_mode = joint_modes(first(channel), beside=models).beside
+    claim = lower_by_noise(claim_of_modes(channel), *models_of(models[0]), *models_of(models[1]))
+    return ModalFilter(
+        plant=drop_names(plant),
+        sensor=drop_names(sensor),
+        plant_modes=find_models("plant", plant, [model for model, _ in by_mode]),
+        sensor_modes=find_models("sensor", sensor, [model for _, model in by_mode]),
+        **fields_of_joint_modes(plant, sensor, channel, claim),
+    )
+
+
+def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, claim: Claim) -> dict[str, Any]:
+    """Return the channel's observation models by mode, and the sizes, of a filter of joint modes."""
+    initial, described = channels_by_mode(channel, (first(plant), first(sensor)))
+    return {"channel": described, "initial": initial, **make_sizes(claim, first(plant), first(channel).outputs)}
+
+
+def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
+    """Return the law of the modes at the first step, and the channel by mode; links without memory have one mode.
+
+    `beside`: plant and sensor, whose modes come before the channel's.
+    """
+    steps = [joint_modes(c, beside=beside) for c in unstack(channel)]
+    models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, restack(models, channel)
+
+
+def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
+    """Return the moments of the channel by mode at one step, and the transition from the step before."""
+    mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
+    gains, noises = zip(*(split_off_noise(nominal_spread(m).center) for m in now.maps), strict=True)
+    noise = WeightedColumns(*(stack_parts(part) for part in zip(*noises, strict=True)))
+    return ChannelByMode(
+        transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
+    )
+
+
+def claim_of_modes(channel: Channel) -> Claim:
+    """Return "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
+    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"

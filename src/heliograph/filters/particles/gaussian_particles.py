@@ -1,0 +1,89 @@
+"""Particles that are Gaussians in each of several modes: their state, and sums of their moments."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.particles.moments import FirstSums, StateSums, second_sums
+from heliograph.filters.particles.resampling import effective_number
+from heliograph.numerics.angle import Angles, wrap_angles
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Bool, Float, Int
+
+
+class Cloud(NamedTuple):
+    """Particles (N, ...): the Gaussian of x in every mode, and log probabilities of the modes (N, M)."""
+
+    gaussian: Gaussian
+    log_mode: jax.Array
+
+
+class PartlyDrawn(NamedTuple):
+    """N particles: of each the Gaussian of x in every mode, drawn states first, with log probabilities of the modes.
+
+    Where mode and drawn states are drawn, one mode has probability 1, and the drawn states have variance 0 in it.
+    `moved` is true from the first prediction on.
+
+    Shapes: the Gaussians (N, M, n), log_mode (N, M), log_weight (N,), the largest 0, key (2,).
+    """
+
+    gaussian: Gaussian
+    log_mode: Float[jax.Array, "N M"]
+    log_weight: Float[jax.Array, " N"]
+    key: Int[jax.Array, " 2"]
+    moved: Bool[jax.Array, ""]
+
+    @property
+    @in_float64
+    def weight(self) -> jax.Array:
+        """Weights (N,), which sum to 1."""
+        return jax.nn.softmax(self.log_weight)
+
+    @property
+    @in_float64
+    def effective_number(self) -> jax.Array:
+        """1 / sum of the squared weights: how many particles of equal weight would say as much."""
+        return effective_number(self.weight)
+
+    @property
+    @in_float64
+    def mode_weights(self) -> jax.Array:
+        """Probabilities (N, M) of particle and mode."""
+        return self.weight[:, None] * jax.nn.softmax(self.log_mode, axis=1)
+
+
+def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
+    """Return Gaussians (N, n) as those of every mode (N, M, n)."""
+    repeated: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
+    return repeated
+
+
+def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
+    """Return the first sums of particles (B,) and modes, and of the weights of modes.
+
+    The mean direction is that of E exp(i angle), and an angle's Gaussian has exp(i m - variance / 2).
+    """
+    share, mean = _list_parts(weight, particles)
+    variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)
+    size, angle = share[:, None] * jnp.exp(-variances[:, list(angles)] / 2), mean[:, list(angles)]
+    around = jnp.sum(size * jnp.sin(angle), axis=0), jnp.sum(size * jnp.cos(angle), axis=0)
+    sums = FirstSums(jnp.sum(weight), jnp.sum(weight**2), share @ mean, *around)
+    modes = particles.log_mode.shape[1]
+    return StateSums(sums, jnp.sum(share.reshape(-1, modes), axis=0) if modes > 1 else None)
+
+
+def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
+    """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
+    share, mean = _list_parts(weight, particles)
+    apart = wrap_angles(mean - sums.first.mean(angles), angles)
+    within = particles.gaussian.covariance.reshape(len(share), *2 * mean.shape[1:])
+    return second_sums(share, apart) + jnp.einsum("a,aij->ij", share, within)
+
+
+def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Array]:
+    """Return weights (B M,) of particles and modes, and their means (B M, n)."""
+    x, log_mode = particles
+    share = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()
+    return share, jnp.asarray(x.mean).reshape(len(share), -1)

@@ -1,0 +1,58 @@
+"""Draw the leading states of a Gaussian: the law of the others given them, and the density of what was drawn."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.factors.covariance_factors import decorrelate, square_root
+from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.factors.repeated_measurements import rounding_of_products
+from heliograph.numerics.gaussian_density import LOG_TURN
+
+
+def slopes_given_drawn(
+    function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return f(mean), and the slopes (m, n) of f in xi of x = m + L xi; `drawn`: leading states that are known.
+
+    The slopes in the drawn states are 0, since these have no variance.
+    """
+
+    def of_others(others: jax.Array) -> jax.Array:
+        """Return f of the states that are not drawn, with the drawn ones at their means."""
+        return function(jnp.concatenate([x.mean[:drawn], others]))
+
+    others = x.mean[drawn:]
+    slopes = jax.jacfwd(of_others)(others) @ x.root[drawn:, drawn:]
+    return of_others(others), jnp.pad(slopes, ((0, 0), (drawn, 0)))
+
+
+def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
+    """Return x given its leading states, drawn as mean + L sqrt(variance) draw; draw (drawn,) is standard normal."""
+    drawn = len(draw)
+    xi = square_root(x.variances[:drawn]) * draw
+    return x._replace(mean=x.mean + x.root[:, :drawn] @ xi, variances=x.variances.at[:drawn].set(0.0))
+
+
+def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
+    """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,)."""
+    drawn = len(d)
+    second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
+    return x.variances[:drawn] <= rounding_of_products(drawn, second)
+
+
+def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
+    """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0."""
+    drawn = len(d)
+    xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
+    variances = jnp.where(certain, 1.0, x.variances[:drawn])
+    log_density = jnp.where(certain, 0.0, -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2)
+    mean = (x.mean + x.root[:, :drawn] @ xi).at[:drawn].set(d)
+    given = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
+    return given, jnp.sum(log_density)
+
+
+def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:
+    """Draw an index by each row of log weights (N, M), with a uniform number each (N,)."""
+    return jnp.sum(jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)[:, :-1] <= uniform[:, None], axis=1)

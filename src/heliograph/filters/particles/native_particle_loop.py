@@ -1,0 +1,399 @@
+"""Particle filters row by row in native code: compiled for one particle, called on all in the lanes of vectors.
+
+A run of many particles is no program of native code, which takes small arrays. But what is done with a particle is one,
+and keys and numbers of particles say what each draws. Three calls a row: particles move and are weighed, a lane each;
+first sums of them, a lane for GROUP; second sums about the means. Between them the particles that go on are chosen.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import choose_code, compute_once
+from heliograph.filters.chunks import ScanResult
+from heliograph.filters.particles.expected_measurement import find_reference_particle
+from heliograph.filters.particles.resampling import resample_concrete_weights
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.types import Array, PyTree
+
+Call = Callable[..., Any]
+GROUP = 16  # particles that a lane adds up
+
+
+class DataRow(NamedTuple):
+    """A row of data, or rows along a leading axis: number k, z, u and random keys; `moved`: it is not the first."""
+
+    k: Array
+    z: Array
+    u: Array
+    noise_key: Array
+    proposal_key: Array
+    moved: Array
+
+
+class ParticleGroup(NamedTuple):
+    """Particles of a row with a leading axis: weights before and with z, what each is, and what it expects of z."""
+
+    prior: Array
+    weight: Array
+    particles: PyTree
+    predicted: tuple[Array, ...]
+
+
+class ParticleSums(NamedTuple):
+    """Sums over the particles of a row: of states and of what is received as `_pack_sums` makes them, `second` (n, n).
+
+    `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
+    """
+
+    states: np.ndarray
+    received: np.ndarray
+    second: np.ndarray
+    reference: tuple[np.ndarray, ...]
+    density: np.ndarray
+
+
+def filter_particles(
+    filter: Any, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
+) -> ScanResult | None:
+    """Filter rows with particles in lanes; None of no rows, or without native code.
+
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), NaN for what did not arrive.
+        u: inputs (rows, inputs).
+        state: before the first row; that before any unless given.
+        begin: number of the first row.
+
+    Returns:
+        The last state, and for each row the mean, the covariance, the innovation, None and the effective number.
+    """
+    if not len(z):
+        return None
+    with jax.enable_x64(True):
+        return _filter_rows(filter, np.asarray(z), np.asarray(u), state, int(begin))
+
+
+class _RowArrays(NamedTuple):
+    """Arrays that the programs of a row read in place: the row, particles, and sums over them.
+
+    `particles` are those before the row, a tree, and `log_weight` their log weights, the largest 0; `prior` are the
+    weights that these are the logarithms of, and `weight` those with z, the largest 1. Behind the last particle others
+    of weight 0 fill the last group, at the place of the first.
+    """
+
+    row: DataRow
+    used: np.ndarray
+    particles: PyTree
+    log_weight: np.ndarray
+    numbers: np.ndarray
+    prior: np.ndarray
+    weight: np.ndarray
+    reference: tuple[np.ndarray, ...]
+    states: np.ndarray
+
+
+class _ParticlePrograms(NamedTuple):
+    """Code of what is done with particles, with the filter's own arrays: calls in memory of their own.
+
+    `now` are the particles behind the last row, and `log_weight` their log weights; `predicted` what each expected.
+    """
+
+    memory: _RowArrays
+    now: PyTree
+    log_weight: np.ndarray
+    predicted: tuple[np.ndarray, ...]
+    advance: Any
+    first: Any
+    second: Any
+
+
+def _compile_programs(
+    filter: Any, z: np.ndarray, u: np.ndarray, keys: tuple[np.ndarray, np.ndarray]
+) -> _ParticlePrograms | None:
+    """Return the three programs of a row, compiled with the arrays that they share; None without native code.
+
+    Args:
+        filter: the filter.
+        z: measurements, of which the first row gives the shape, as of `u` and `keys`.
+        u: inputs.
+        keys: of noises and of proposals, (rows, ...) each.
+    """
+    # Their number rounded up to whole groups, and the arrays that several programs read: row, particles, weights.
+    length = -(-filter.particles // GROUP) * GROUP
+    numbers = np.arange(length, dtype=np.uint32)
+    noise_key, proposal_key = (np.zeros_like(part[0]) for part in keys)
+    row = DataRow(
+        k=np.zeros((), int), z=np.zeros_like(z[0]), u=np.zeros_like(u[0]), noise_key=noise_key,
+        proposal_key=proposal_key, moved=np.ones((), bool),
+    )  # fmt: skip
+    used, particles = np.ones((), bool), filter.allocate_particles(length)
+    log_weight, prior, weight = np.zeros((3, length))
+    # First program: a particle moved and weighed in each lane. It returns the particle's arrays, its log weight, and
+    # what it expected of z. Booleans say which arguments differ from lane to lane.
+    before = row, used, particles, log_weight, numbers
+    advance = _compile_in_place(_advance_particle, filter, before, (False, False, True, True, True), length)
+    if advance is None:
+        return None
+    leaves, structure = jax.tree.flatten(particles)
+    now = jax.tree.unflatten(structure, advance.outputs[: len(leaves)])
+    log_weight_now, predicted = advance.outputs[len(leaves)], tuple(advance.outputs[len(leaves) + 1 :])
+    # Second and third: sums over the particles of a group in each lane. `reference`: from what innovations are counted.
+    reference = tuple(np.zeros(part.shape[1:]) for part in predicted)
+    group: ParticleGroup = jax.tree.map(
+        lambda part: part.reshape(length // GROUP, GROUP, *part.shape[1:]),
+        ParticleGroup(prior, weight, now, predicted),
+    )
+    first = _compile_in_place(_sum_for_mean, filter, (row, reference, group), (False, False, True), len(group.weight))
+    if first is None:
+        return None
+    states = np.zeros(first.outputs[0].shape[1])
+    arguments = states, group.weight, group.particles
+    second = _compile_in_place(_sum_for_covariance, filter, arguments, (False, True, True), len(group.weight))
+    if second is None:
+        return None
+    memory = _RowArrays(*before, prior=prior, weight=weight, reference=reference, states=states)
+    return _ParticlePrograms(memory, now, log_weight_now, predicted, advance=advance, first=first, second=second)
+
+
+def _compile_in_place(
+    function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int
+) -> Any:
+    """Return a call of function(filter, *arguments), `runs` times, that reads these arrays in place.
+
+    `differs` says which arguments have an entry for each run. None without native code.
+    """
+    code = _compile_call(function, filter, arguments, differs)
+    return None if code is None else code.for_runs(runs, dict(enumerate(jax.tree.leaves(arguments))))
+
+
+def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
+    """Return the code of function(filter, *arguments), to be called with the arguments; None if there is none."""
+    choice = choose_code(function, (filter, *arguments), [False, *differs])
+    if choice.code is None:
+        return None
+    return choice.code.with_first_arguments(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
+
+
+def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
+    """Return the particle of this number before any row, drawn with the key."""
+    return _take_first(filter.draw_start(key, number[None]))
+
+
+def _take_first(tree: PyTree) -> PyTree:
+    """Return the first of arrays along their leading axis."""
+    return jax.tree.map(lambda leaf: leaf[0], tree)
+
+
+def _advance_particle(
+    filter: Any, row: DataRow, used: Array, particle: PyTree, log_weight: Array, number: Array
+) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
+    """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
+    numbers = jnp.asarray(number)[None]
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
+    moved, law = filter.move_particles(one, numbers, row.noise_key, row.u, row.k, row.moved)
+    weighed = filter.weigh_particles(moved, law, numbers, row.proposal_key, row.z, row.k)
+    likelihood = jnp.where(used, weighed.log_likelihood[0], 0.0)
+    after = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
+    return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
+
+
+def _sum_for_mean(
+    filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
+) -> tuple[jax.Array, jax.Array]:
+    """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
+    group = jax.tree.map(jnp.asarray, group)
+    received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
+    return _pack_sums(filter.sum_for_mean(group.weight, group.particles)), _pack_sums(received)
+
+
+def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
+    """Return the second sums of the states of a group of particles, about the means of all."""
+    weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
+    sums = _unpack_sums(states, filter.sum_for_mean, weight, particles)
+    second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
+    return second
+
+
+def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
+    """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles."""
+    one, weight = jax.tree.map(jnp.asarray, filter.allocate_particles(1)), jnp.ones(1)
+    states = _unpack_sums(sums.states, filter.sum_for_mean, weight, one)
+    predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
+    received = _unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
+    estimate = filter.estimate_from_sums(states, sums.second)
+    innovation = filter.innovation_from_sums(received, sums.reference, row.z, row.k, sums.density)
+    count = states.first.weight**2 / states.first.square
+    return estimate.mean, estimate.covariance, innovation, estimate.modes, count
+
+
+def _pack_sums(sums: PyTree) -> jax.Array:
+    """Return sums as one vector."""
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
+
+
+def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
+    """Return the sums that `_pack_sums` made one vector of, like those of a function of these arguments."""
+    leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
+    ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
+    parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
+    return jax.tree.unflatten(form, [part.reshape(leaf.shape) for part, leaf in parts])
+
+
+def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
+    """Return last state and outputs of rows of data, the first with number `begin`; None without native code.
+
+    `z`: (rows, received), NaN for what did not arrive; `u`: (rows, inputs). `state`: that after the row before; None at
+    the start, where particles are drawn.
+    """
+    # Random keys of all rows at once: they depend on the data, and on no particle.
+    key = None if state is None else np.asarray(state.key)
+    start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
+        _draw_keys, _draw_keys_by_xla, (filter, z, key)
+    )
+    k = begin + np.arange(len(z))
+    moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
+    rows = DataRow(k=k, z=z, u=u, noise_key=noise_keys, proposal_key=proposal_keys, moved=moved)
+    programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
+    if programs is None:
+        return None
+    # The particles before the first row: drawn, or those of the state.
+    loop = _ParticleLoop(filter, programs)
+    if state is None:
+        numbers = programs.memory.numbers[: filter.particles]
+        draw = _compile_call(_draw_start, filter, (start_key, numbers), (False, True))
+        if draw is None:
+            return None
+        loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
+    else:
+        loop.set_particles(jax.tree.map(np.asarray, filter.get_particles(state)), np.asarray(state.log_weight))
+    # Row by row the sums over particles, then of these the outputs of all rows, a row in each lane.
+    steps = [
+        loop.filter_row(DataRow(*row), choice_start)
+        for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
+    ]
+    sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
+    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
+    if outputs.code is None:
+        return None
+    return ScanResult(loop.last_state(last_key), outputs.results())
+
+
+def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
+    """Return the random keys and numbers of rows that no particle changes.
+
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), which keys depend on.
+        key: of the state before the rows; None before any.
+
+    Returns:
+        Key of x_0; uniform numbers by which particles are chosen (rows,); the key after the last row; keys of noises,
+        and of proposals (rows, ...).
+    """
+
+    def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        """Return the key after a row, and what is drawn for it."""
+        key, choice_key, noise_key = filter.keys_of_prediction(key)
+        key, proposal_key = filter.keys_of_correction(key, row)
+        return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
+
+    first, start_key = filter.start_keys()
+    last, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
+        draw, first if key is None else jnp.asarray(key), jnp.asarray(z)
+    )
+    return start_key, choice_starts, last, noise_keys, proposal_keys
+
+
+_draw_keys_by_xla = quickly_compiled(_draw_keys)
+
+
+class _ParticleLoop:
+    """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
+
+    def __init__(self, filter: Any, programs: _ParticlePrograms):
+        self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
+        self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
+        self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
+        self.held = jax.tree.leaves(self.now)
+        self.pairs = list(zip(self.held, jax.tree.leaves(self.memory.particles), strict=True))
+
+    def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
+        """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
+        memory, count = self.memory, self.count
+        for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
+            held[:count], held[count:] = new, new[0]
+        memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
+        np.exp(memory.log_weight, out=memory.weight)
+        self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
+
+    def filter_row(self, row: DataRow, choice_start: float) -> ParticleSums:
+        """Choose the particles that go on, move and weigh them, in place; return the sums over them.
+
+        `choice_start`: a uniform number, with which the choice begins.
+        """
+        memory, programs = self.memory, self.programs
+        for held, new in zip(memory.row, row, strict=True):
+            held[...] = new
+        self._choose_particles(choice_start)
+        # Move and weigh; a row that no particle explains is not used: they are only moved.
+        used = self.filter.uses_empty_rows or not np.isnan(row.z).all()
+        largest = self._advance(used)
+        excluded = used and not largest > -np.inf
+        if excluded:
+            largest = self._advance(False)
+        # weight = exp(log weight - largest).
+        np.subtract(self.log_weight, largest, out=memory.log_weight)
+        np.exp(memory.log_weight, out=memory.weight)
+        # First sums of all groups, then second sums about the means (einsum: in half of the time of add.reduce).
+        self._find_reference()
+        programs.first()
+        states = np.einsum("ij->j", programs.first.outputs[0], out=memory.states)
+        received = np.einsum("ij->j", programs.first.outputs[1])
+        programs.second()
+        second = np.einsum("ijk->jk", programs.second.outputs[0])
+        # The sums of states begin with those of weights and of their squares. log p(z) is log of the sum of weights
+        # with z less that of weights before.
+        sum_before, self.sum, self.square = self.sum, float(states[0]), float(states[1])
+        density = -np.inf if excluded else math.log(self.sum) + largest - math.log(sum_before)
+        reference = tuple(part.copy() for part in memory.reference)
+        return ParticleSums(states.copy(), received, second, reference=reference, density=np.asarray(density))
+
+    def _choose_particles(self, start: float) -> None:
+        """Let particles go on as they are, or resampled where the effective number is too small."""
+        memory, count = self.memory, self.count
+        if not self.sum**2 / self.square < self.resample * count:
+            for held, new in self.pairs:
+                new[...] = held
+            memory.prior[...] = memory.weight
+            return
+        which = resample_concrete_weights(memory.weight[:count], start)
+        for held, new in self.pairs:
+            np.take(held, which, axis=0, out=new[:count], mode="clip")
+        memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
+
+    def _advance(self, used: bool) -> float:
+        """Move particles, and weigh them by z if the row is used; return the largest log weight."""
+        self.memory.used[...] = used
+        self.programs.advance()
+        for held in (*self.held, *self.predicted):
+            held[self.count :] = held[0]
+        return float(self.log_weight.max())
+
+    def _find_reference(self) -> None:
+        """Keep what the heaviest particle before z was known expects, of those where it is a number."""
+        prior: Any = self.memory.prior
+        best: Any = np.argmax(prior)
+        if not all(np.isfinite(part[best]).all() for part in self.predicted):
+            best = find_reference_particle(prior[: self.count], tuple(part[: self.count] for part in self.predicted))
+        for held, new in zip(self.memory.reference, self.predicted, strict=True):
+            held[...] = new[best]
+
+    def last_state(self, key: np.ndarray) -> Any:
+        """Return the state of the filter after the last row, given the key of what follows."""
+        particles = jax.tree.map(lambda leaf: np.array(leaf[: self.count]), self.now)
+        return self.filter.make_state(particles, np.array(self.memory.log_weight[: self.count]), key)

@@ -1,0 +1,400 @@
+"""Rao-Blackwellised particle filter: some states and the modes are drawn, the others are a Gaussian given these.
+
+A particle is a mode, and a Gaussian of x = (d, l), drawn states first. Over a step, and before z is known, it is one
+Gaussian of each mode that may follow; with z one mode is drawn, then d, and l keeps its law given both.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import WeightedColumns, factor_covariances, join_columns
+from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
+from heliograph.filters.base import Step, corrects, estimates, predicts
+from heliograph.filters.particles.base import (
+    AbstractStateParticleFilter,
+    WeighedParticles,
+    relative_to_largest,
+    update_if_used,
+)
+from heliograph.filters.particles.expected_measurement_mixture import (
+    ExpectedMixture,
+    ReceivedSums,
+    compute_mixture_innovation,
+    find_reference_innovation,
+    sum_mixtures,
+)
+from heliograph.filters.particles.gaussian_particles import (
+    Cloud,
+    PartlyDrawn,
+    repeat_for_modes,
+    sum_clouds_for_covariance,
+    sum_clouds_for_mean,
+)
+from heliograph.filters.particles.leading_state_draws import (
+    condition_on_draw,
+    condition_on_leading_states,
+    draw_index,
+    find_states_without_variance,
+    slopes_given_drawn,
+)
+from heliograph.filters.particles.moments import StateSums
+from heliograph.filters.particles.proposal import PRIOR_SHARE, factor_noise_covariance
+from heliograph.filters.particles.received_density import ReceivedAtoms
+from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.modes_of_motion import models_of
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AbstractPlant, LinearPlant
+from heliograph.model.sensor import AbstractSensor, LinearSensor
+from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
+from heliograph.numerics.types import Array, Float
+
+
+class ReceivedByMode(NamedTuple):
+    """What arrived: z (m,), and for each mode the atoms of its density given h(x), and these as one Gaussian.
+
+    Shapes: weight (M, a), gain (M, a, m, p), offset (M, a, m), noise factors (M, a, m, m); `overall` without a.
+    """
+
+    z: jax.Array
+    weight: jax.Array
+    gain: jax.Array
+    offset: jax.Array
+    noise: WeightedColumns
+    overall: tuple[jax.Array, jax.Array, WeightedColumns]
+
+
+class PartlyDrawnFilter(AbstractStateParticleFilter):
+    """Particles draw modes and named states, the other states are Gaussian given these. Built by `particle_filter`."""
+
+    initial: Float[Array, " M"]
+    transition: Float[Array, "M M"]
+    plant_modes: tuple[int, ...] = eqx.field(static=True)
+    sensor_modes: tuple[int, ...] = eqx.field(static=True)
+    order: tuple[int, ...] = eqx.field(static=True)  # places of the states, drawn ones first
+    drawn: int = eqx.field(static=True)  # how many are drawn
+
+    @property
+    def uses_empty_rows(self) -> bool:
+        """Return whether a row in which nothing arrived says something, of the modes."""
+        return len(self.initial) > 1
+
+    @compile_on_call
+    def init(self) -> PartlyDrawn:
+        """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
+        key, own = self.start_keys()
+        particles = self.draw_start(own, jnp.arange(self.particles))
+        return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
+
+    def allocate_particles(self, count: int) -> Any:
+        """Return arrays of so many particles, to be filled."""
+        modes, n = len(self.initial), len(self.order)
+        each: Any = (np.zeros((count, modes, *size)) for size in ((n,), (n * (n - 1) // 2,), (n,), ()))
+        mean, lower, variances, log_mode = each
+        return Cloud(Gaussian(mean, lower, variances), log_mode)
+
+    def get_particles(self, state: PartlyDrawn) -> Cloud:
+        """Return the Gaussian of each particle in each mode, and log probabilities of the modes."""
+        return Cloud(state.gaussian, state.log_mode)
+
+    def make_state(self, particles: Cloud, log_weight: jax.Array, key: jax.Array) -> PartlyDrawn:
+        """Return the state of particles with these log weights."""
+        return PartlyDrawn(particles.gaussian, particles.log_mode, log_weight, key, jnp.asarray(True))
+
+    def start_keys(self) -> tuple[jax.Array, jax.Array]:
+        """Return the key of the first step, and that of the draws of x_0."""
+        key, own = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, own
+
+    def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
+        """Return the law of x_0 for the particles of these numbers (B,)."""
+        start, count, order = models_of(at(self.plant, 0))[0], len(numbers), np.array(self.order)
+        x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
+        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
+        if not self._is_linear(models_of(at(self.plant, 0))):
+            x = self._draw_states(x, key, numbers)
+        log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (count, 1))
+        return Cloud(repeat_for_modes(x, len(self.initial)), log_mode)
+
+    @predicts
+    def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
+        """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
+        key, choice, own = self.keys_of_prediction(state.key)
+        which, log_weight = self.choose_particles(state.log_weight, choice)
+        particles = jax.tree.map(lambda leaf: leaf[which], self.get_particles(state))
+        moved, _ = self.move_particles(particles, None, own, jnp.asarray(u), k, state.moved)
+        return self.make_state(moved, log_weight, key)
+
+    def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
+        keys = jax.random.split(jax.random.fold_in(key, 0), 4)
+        return keys[0], keys[1], keys[2:]
+
+    def move_particles(
+        self, particles: Cloud, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
+    ) -> tuple[Cloud, None]:
+        """Move the Gaussians of particles (B,) by the law of every mode that may follow."""
+        plants, (gaussian, log_mode) = models_of(at(self.plant, k)), particles
+        # What no measurement has drawn is drawn now; at the first step of a linear plant the start stays a Gaussian.
+        mode = draw_index(log_mode, draw_uniforms(key[1], numbers, 1, self.particles)[:, 0])
+        in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(len(mode)), mode], gaussian)
+        x = self._draw_states(in_mode, key[0], numbers)
+        if self._is_linear(plants):
+            x = jax.tree.map(lambda new, old: jnp.where(moved, new, old), x, in_mode)
+        # The law after the step in each mode that may follow.
+        by_model = [
+            jax.vmap(lambda particle, plant=plant: self._move_particle(plant, particle, u))(x) for plant in plants
+        ]
+        after: Gaussian = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1)[:, self.plant_modes, ...], *by_model)
+        chance = jnp.where(moved, jnp.asarray(self.transition)[mode], jnp.asarray(self.initial))
+        return Cloud(after, jnp.log(chance)), None
+
+    def _is_linear(self, plants: Sequence[AbstractPlant]) -> bool:
+        """Return whether the plant is linear in the drawn states too, so that they need not be drawn to be moved."""
+        return all(isinstance(plant, LinearPlant) and not plant.circular for plant in plants)
+
+    def _draw_states(self, x: Gaussian, key: jax.Array, numbers: jax.Array | None) -> Gaussian:
+        """Return Gaussians (B, n) given their drawn states, which are drawn here."""
+        return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
+
+    def _move_particle(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
+        """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
+        order = np.array(self.order)
+        # Of a linear plant the drawn states may have a variance still; of others they are known.
+        noise, known = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
+
+        def move(x: jax.Array) -> jax.Array:
+            """Return f(x), drawn states first in x and in the result."""
+            return plant.transition(self._in_plants_order(x), u)[order]
+
+        mean, slopes = slopes_given_drawn(move, x, known)
+        spread = WeightedColumns(slopes[:, known:], x.variances[known:])
+        return from_columns(
+            mean + plant.noise_mean()[order], join_columns(spread, WeightedColumns(noise.matrix[order], noise.weights))
+        )
+
+    def _in_plants_order(self, x: jax.Array) -> jax.Array:
+        """Return x (..., n) in the order of the plant's states."""
+        return x[..., np.argsort(self.order)]
+
+    @corrects
+    def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
+        """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
+        z = jnp.asarray(z)
+        key, proposing = self.keys_of_correction(state.key, z)
+        weighed = self.weigh_particles(self.get_particles(state), None, None, proposing, z, k)
+        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
+        # All weights zero: the row is not used.
+        log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
+        updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
+        used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
+        after = update_if_used(used, updated, state._replace(key=key))
+        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
+
+    def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return keys of what follows, and of the drawn states and of the choices (2, 2)."""
+        key = fold_in_bits(key, z)
+        return key, jax.random.split(jax.random.fold_in(key, 2))
+
+    def weigh_particles(
+        self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
+    ) -> WeighedParticles:
+        """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
+        sensors, (gaussian, log_mode) = models_of(at(self.sensor, k)), particles
+        atoms, chance = at(self.density, k).given_arrivals(z)
+        received = self._find_atoms_by_mode(z, atoms)
+        # That nothing or only a part arrived says something of the mode.
+        log_mode = log_mode + jnp.log(chance)
+        draws = draw_normals(key[0], numbers, self.drawn, self.particles)
+        uniform = draw_uniforms(key[1], numbers, 3, self.particles)
+        draw_and_weigh = jax.vmap(partial(self._draw_and_weigh, sensors, received))
+        x, mode, log_ratio = draw_and_weigh(gaussian, log_mode, draws, uniform)
+        plant, modes = models_of(at(self.plant, k))[0], len(self.initial)
+        x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
+        certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
+        predicted = jax.vmap(partial(self._expect_received, sensors, received))(gaussian, log_mode)
+        return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
+
+    def _find_atoms_by_mode(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
+        """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
+        gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
+        return ReceivedByMode(
+            z=z,
+            weight=jnp.asarray(atoms.weight),
+            gain=jnp.asarray(atoms.gain),
+            offset=jnp.asarray(atoms.offset),
+            noise=jax.vmap(factor_covariances)(jnp.asarray(atoms.noise)),
+            overall=(gain, offset, factor_covariances(noise)),
+        )
+
+    def _angles_in_order(self, plant: AbstractPlant) -> Angles:
+        """Return the places of the angles, drawn states first."""
+        return tuple(i for i, place in enumerate(self.order) if place in plant.angles)
+
+    def _measure(self, sensors: Sequence[AbstractSensor], mode: jax.Array, x: jax.Array) -> jax.Array:
+        """Return h(x) of the mode's sensor, of x with the drawn states first."""
+        position = self._in_plants_order(x)
+        if len(sensors) == 1:
+            return sensors[0].measure(position)
+        return jnp.stack([sensor.measure(position) for sensor in sensors])[jnp.array(self.sensor_modes)[mode]]
+
+    def _draw_and_weigh(
+        self,
+        sensors: Sequence[AbstractSensor],
+        received: ReceivedByMode,
+        x: Gaussian,
+        log_mode: jax.Array,
+        draw: jax.Array,
+        uniform: jax.Array,
+    ) -> tuple[Gaussian, jax.Array, jax.Array]:
+        """Draw mode j and d of one particle from q, and condition it on z: its Gaussian, j, and log (p / q).
+
+        p(j, d, z) is P(j) N(d) sum_a w_a N(z given d, atom a). q(j, d) is P(j) N(d) times N(z) of the linearised sensor
+        and one Gaussian noise, in coordinates of the noise; where that is not p, a share of q is P(j) N(d) itself.
+
+        Args:
+            sensors: one of each mode of the sensor.
+            received: what arrived, with gains and noises by mode and atom.
+            x: Gaussian of the state in each mode, drawn states first.
+            log_mode: log P(j) of each mode.
+            draw: standard normal numbers for d.
+            uniform: three numbers, for prior or posterior, for the mode and for the atom of the noise.
+        """
+        # Posterior of each mode by the linearised sensor, and alpha_j = log P(j) N_j(z); where no mode can produce z
+        # there is no posterior, and the prior is drawn from.
+        share = self._prior_share(sensors, received)
+        modes = jnp.arange(len(self.initial))
+        posterior, alpha = jax.vmap(lambda j, x_j: self._linearised_posterior(sensors, received, j, x_j))(modes, x)
+        alpha = jnp.where(jnp.isnan(alpha), -jnp.inf, alpha) + log_mode
+        possible = jnp.max(alpha) > -jnp.inf
+        log_posterior_mode = alpha - jnp.where(possible, jax.nn.logsumexp(alpha), 0.0)
+        # Draw j, then d given j: from the prior with probability `share`, else from the posterior.
+        from_prior = (uniform[0] < share) | ~possible
+        mode = draw_index(jnp.where(from_prior, log_mode, alpha)[None], uniform[1:2])[0]
+        prior, linearised = (jax.tree.map(lambda leaf: leaf[mode], law) for law in (x, posterior))
+        source: Gaussian = jax.tree.map(lambda a, b: jnp.where(from_prior, a, b), prior, linearised)
+        d = condition_on_draw(source, draw).mean[: self.drawn]
+        # log p(j, d) - log q(j, d), with q = (1 - share) (linearised posterior of j and d) + share P(j) N(d). States
+        # that are known already have no density: they are `certain`, and left out of both.
+        certain = find_states_without_variance(prior, d)
+        rest, log_prior = condition_on_leading_states(prior, d, certain)
+        log_linearised = log_posterior_mode[mode] + condition_on_leading_states(linearised, d, certain)[1]
+        log_p = log_mode[mode] + log_prior
+        log_total = log_p - jax.nn.logsumexp(log_mode)  # of the prior's share, which is a law
+        log_q = jnp.logaddexp(jnp.log1p(-share) + log_linearised, jnp.log(share) + log_total)
+        log_q = jnp.where(possible, log_q, log_total)
+        after, log_density = self._condition_on_atoms(sensors, received, mode, rest, uniform[2])
+        return after, mode, log_density + log_p - log_q
+
+    def _prior_share(self, sensors: Sequence[AbstractSensor], received: ReceivedByMode) -> float:
+        """Return the share of particles that are drawn without z."""
+        if not self.optimal:
+            return 1.0
+        is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
+        return 0.0 if is_exact else PRIOR_SHARE
+
+    def _linearised_posterior(
+        self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
+    ) -> tuple[Gaussian, jax.Array]:
+        """Return x given z in this mode, and the log density of z, of z = gain h(x) + n.
+
+        h is linearised at the mean, in all states; n is one Gaussian in place of the atoms.
+        """
+        gain, offset, noise = jax.tree.map(lambda leaf: leaf[mode], received.overall)
+        y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
+        return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
+
+    def _condition_on_received(
+        self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array
+    ) -> tuple[Gaussian, jax.Array]:
+        """Return x given z = expected + slopes xi + v, and the log density of z."""
+        value = wrap_near(z - expected, jnp.zeros(len(z)), self.observed_angles)
+        after, innovations = condition_on_observation(x, slopes, value, noise, ~jnp.isnan(z))
+        return after, innovations.log_density(~jnp.isnan(z), jnp.abs(z) + jnp.abs(expected))
+
+    def _condition_on_atoms(
+        self,
+        sensors: Sequence[AbstractSensor],
+        received: ReceivedByMode,
+        mode: jax.Array,
+        x: Gaussian,
+        uniform: jax.Array,
+    ) -> tuple[Gaussian, jax.Array]:
+        """Return x, whose drawn states are known, given z and an atom drawn by its probability; and log p(z) of all."""
+        y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, self.drawn)
+
+        def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
+            """Return x given z of one atom, and the log density of z."""
+            return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
+
+        atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))
+        after, densities = jax.vmap(condition_on_atom)(*atoms)
+        densities = jnp.where(jnp.isnan(densities), -jnp.inf, densities) + jnp.log(received.weight[mode])
+        atom = draw_index(densities[None], uniform[None])[0]
+        return jax.tree.map(lambda leaf: leaf[atom], after), jax.nn.logsumexp(densities)
+
+    def _expect_received(
+        self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, x: Gaussian, log_mode: jax.Array
+    ) -> ExpectedMixture:
+        """Return what a particle expects of z in each mode and atom, to first order in h."""
+
+        def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
+            """Return means (atoms, m) of z and their covariances."""
+            y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
+            gain = received.gain[mode]
+            spread = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
+            noise = jax.vmap(lambda matrix, weights: WeightedColumns(matrix, weights).covariance)(
+                *jax.tree.map(lambda leaf: leaf[mode], received.noise)
+            )
+            return gain @ y + received.offset[mode], spread + noise
+
+        expected, total = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)
+        share = jax.nn.softmax(log_mode)[:, None] * received.weight
+        m = len(received.z)
+        chance = jnp.sum(jnp.exp(log_mode))
+        return ExpectedMixture(
+            share=share.ravel(), expected=expected.reshape(-1, m), total=total.reshape(-1, m, m), chance=chance
+        )
+
+    def sum_received(
+        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
+    ) -> ReceivedSums:
+        """Return sums of how far innovations of particles (B,), modes and atoms are from that of a reference."""
+        base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
+        return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
+
+    def innovation_from_sums(
+        self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
+    ) -> Innovation:
+        """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
+        return compute_mixture_innovation(
+            received, find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles), z, density
+        )
+
+    def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
+        """Return the first sums of particles (B,), drawn states first."""
+        return sum_clouds_for_mean(weight, particles, self._angles_in_order(models_of(first(self.plant))[0]))
+
+    def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
+        """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
+        angles = self._angles_in_order(models_of(first(self.plant))[0])
+        return sum_clouds_for_covariance(weight, particles, sums, angles)
+
+    def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
+        """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
+        back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
+        mean = sums.first.mean(self._angles_in_order(models_of(first(self.plant))[0]))
+        modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
+        return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)
+
+    @estimates
+    def estimate(self, state: PartlyDrawn) -> Estimate:
+        """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
+        return self.compute_estimate(state)

@@ -1,0 +1,227 @@
+"""Law of the noise that may hold outliers, as it arrives behind a channel, and the channel without that noise."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, at_each_step
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import is_traced, library
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.mixture_components import GaussianBranches
+from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.random_affine.noise import AbstractNoise, Independent
+from heliograph.random_affine.outlier_noise import (
+    StudentT,
+)
+
+Vector = Float[jax.Array | np.ndarray, " m"]
+Matrix = Float[jax.Array | np.ndarray, "m branches"]
+REGULAR = 1e-7  # least eigenvalue of a noise's correlations: with less, there is no noise in some combination
+TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for rounding
+
+
+class NoiseBranches(NamedTuple):
+    """Gaussian branches of each received component's noise: log probability, mean and variance, (m, branches) each.
+
+    least: the branch's own noise, below which the variance of an innovation is not.
+    """
+
+    log_share: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+    least: jax.Array
+
+    def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
+        """Return the mean and variance of the mixture, (m,) each."""
+        share = jnp.exp(self.log_share)
+        center = jnp.sum(share * self.mean, axis=1)
+        return center, jnp.sum(share * (self.variance + (self.mean - center[:, None]) ** 2), axis=1)
+
+
+class ReceivedNoise(Module):
+    """Noise of each received component that may hold outliers: of one output of the sensor, and of the last hop.
+
+    `share`, `mean`, `variance`: branches of the output's noise, before the gain; `late_mean`, `late_variance` what the
+    last hop adds to each (m, branches). `output` (m, p) picks the output, `gain` is E[g] and `power` E[g^2] (m,).
+    `center` and `covariance` (m, m): the same noise without outliers, as it arrives. `degrees` (m,): Student's.
+    """
+
+    log_share: Matrix
+    mean: Matrix
+    variance: Matrix
+    late_mean: Matrix
+    late_variance: Matrix
+    output: Float[jax.Array | np.ndarray, "m p"]
+    gain: Vector
+    power: Vector
+    center: Vector
+    covariance: Float[jax.Array | np.ndarray, "m m"]
+    degrees: Vector
+
+    def find_branches(self, sensed: jax.Array) -> NoiseBranches:
+        """Return the mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
+
+        Branch j of a noise before the gain arrives with mean E[g] m_j and variance
+        E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
+        mean together. With that of the signal alone, Var(g) y^2, it is at least E[g^2] r_j.
+        """
+        gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
+        signal = (self.output @ sensed)[:, None]
+        least = power * self.variance + self.late_variance
+        spread, both = power - gain**2, mean + 2 * signal
+        variance = least + spread * mean * both
+        return NoiseBranches(
+            log_share=jnp.asarray(self.log_share),
+            mean=jnp.asarray(gain * mean + self.late_mean),
+            variance=jnp.asarray(variance),
+            least=jnp.asarray(least),
+        )
+
+
+def separate_outlier_noise(
+    sensor: AnySensor, channel: Channel, independent: bool
+) -> tuple[SecondOrder | OverTime, ReceivedNoise | OverTime]:
+    """Return moments of z without the noise that may hold outliers, and that noise as it arrives at the filter.
+
+    `independent`: whether its components must be independent, since they are used one after another.
+
+    Raises:
+        ValueError: components of the noise that are correlated or mixed by the channel, no noise that could be weighed.
+    """
+
+    def describe(step: AbstractRandomAffine) -> SecondOrder:
+        """Return the moments of one step's channel without its outliers."""
+        return Polytope().describe(step.detach_outliers()[0])
+
+    def describe_noise(sensor: AbstractSensor, step: AbstractRandomAffine, plain: SecondOrder) -> ReceivedNoise:
+        """Return the noise that may hold outliers at one step, as it arrives."""
+        return describe_outlier_noise(sensor.noise, step.detach_outliers()[1], plain, independent)
+
+    plain: SecondOrder | OverTime = at_each_step(describe, channel)
+    noise: ReceivedNoise | OverTime = at_each_step(describe_noise, sensor, channel, plain)
+    return plain, noise
+
+
+def describe_outlier_noise(
+    sensed: AbstractNoise, late: AbstractNoise | None, plain: SecondOrder, independent: bool
+) -> ReceivedNoise:
+    """Return the noise that may hold outliers, as it arrives in m received numbers.
+
+    Args:
+        sensed: noise of the sensor's p outputs.
+        late: noise of the last hop; None where that has no outliers.
+        plain: moments of the channel without the noise of the last hop.
+        independent: whether correlated components are refused.
+
+    Raises:
+        ValueError: components that are correlated where they may not be, or mixed; no noise that could be weighed.
+    """
+    m, p = plain.mean_gain.shape
+    # xp: numpy, or jax.numpy for numbers that are traced.
+    rows, xp = np.arange(m), library(plain.power.center, sensed, late)
+    squares = xp.stack([xp.diagonal(plain.power.center[i, i]) for i in range(m)])[:, :p]  # E[G_ia^2]
+    # Moments of the noise without its outliers, as it arrives.
+    base = sensed.without_outliers()
+    covariance = xp.einsum("ijab,ab->ij", plain.power.center[..., :p, :p], base.covariance)
+    center = plain.mean_gain @ base.mean
+    # The output whose noise each received number brings (m,).
+    source = _find_noisy_outputs(squares, base.covariance, plain)
+    if late is not None:
+        last = late.without_outliers()
+        covariance, center = covariance + last.covariance, center + last.mean
+    _check_weighable(covariance, independent)
+    # Branches of the sensor's noise, and their pairs with those of the last hop's.
+    log_share, mean, variance = (values[source] for values in sensed.branches())
+    late_mean: Array = np.zeros(mean.shape)
+    late_variance: Array = late_mean
+    if late is not None:
+        log_share, mean, variance, late_mean, late_variance = _combine_branches(
+            GaussianBranches(log_share, mean, variance), late.branches()
+        )
+    return ReceivedNoise(
+        log_share=log_share, mean=mean, variance=variance, late_mean=late_mean, late_variance=late_variance,
+        output=np.eye(p)[source], gain=plain.mean_gain[rows, source], power=squares[rows, source],
+        center=center, covariance=covariance, degrees=_student_degrees(sensed, late)[source],
+    )  # fmt: skip
+
+
+def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
+    """Return the sensor's output whose noise each received component brings, (m,).
+
+    `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
+
+    Raises:
+        ValueError: one that brings the noise of several.
+    """
+    m, p = squares.shape
+    if is_traced(squares, covariance):
+        if m != p:
+            raise fail("channel with free numbers before a robust filter", f"{p} outputs", m)
+        return np.arange(m)
+    brought = np.asarray(squares) * np.diag(np.asarray(covariance))
+    largest = np.max(brought, axis=1, keepdims=True, initial=0.0)
+    several = np.count_nonzero(brought > TOLERANCE**2 * largest, axis=1)
+    if np.any(several > 1):
+        expected = "one that brings each received number the noise of one output of the sensor"
+        raise fail("channel of a robust filter", expected, f"{several.max()} outputs in number {int(several.argmax())}")
+    return np.asarray(np.argmax(brought, axis=1))
+
+
+def _check_weighable(covariance: Array, independent: bool) -> None:
+    """Raise ValueError where no noise could be weighed, or where components are correlated and may not be.
+
+    Nor may they be tied: other weights would make another combination of them the one without noise, a wrong one.
+    """
+    if is_traced(covariance):
+        return
+    variance = np.diag(covariance)
+    if np.any(variance <= 0):
+        expected = "noise of the sensor (or a law with outliers in the last hop) in each received number"
+        raise fail("noise of a robust filter", expected, f"variance {variance.min():g}")
+    deviation = np.sqrt(variance)  # the product of two large variances may overflow
+    correlations = covariance / np.outer(deviation, deviation)
+    off = np.abs(correlations - np.eye(len(variance)))
+    if independent and np.any(off > TOLERANCE):
+        expected = "independent components (Huber, InverseMultiquadric, WoLF and Gate take correlated ones)"
+        raise fail("noise of a robust filter", expected, f"a correlation of {off.max():.3g}")
+    if (least := np.linalg.eigvalsh(correlations)[0]) < REGULAR:
+        expected = "some in each combination of the received numbers"
+        raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
+
+
+def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
+    """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
+
+    Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
+    """
+    xp = library(sensed, late)
+    shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
+
+    def repeat(values: Array, axis: int) -> Array:
+        """Return values (m, branches) for all pairs, the same along this axis of (m, sensor's, last hop's)."""
+        pairs: Array = xp.broadcast_to(xp.expand_dims(values, axis), shape).reshape(shape[0], -1)
+        return pairs
+
+    log_share = repeat(sensed.log_share, axis=2) + repeat(late.log_share, axis=1)
+    sensed_moments = repeat(sensed.mean, axis=2), repeat(sensed.variance, axis=2)
+    return log_share, *sensed_moments, repeat(late.mean, axis=1), repeat(late.variance, axis=1)
+
+
+def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
+    """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law."""
+    parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
+    values = [
+        component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None
+        else np.full(component.dimension, np.nan)
+        for component in parts
+    ]  # fmt: skip
+    degrees: Vector = library(values).concatenate(values)
+    return degrees

@@ -1,0 +1,75 @@
+"""Windows of rows of a recording, and the results of runs over them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.engine.choice import choose_code
+from heliograph.numerics.types import Int, PyTree
+
+Which = slice | np.ndarray  # some of several, by their numbers
+
+
+class WindowBatch(NamedTuple):
+    """Some of several windows: their numbers, the first row of each (n,), and their rows (n, length, ...)."""
+
+    which: slice
+    first: Int[np.ndarray, " n"]
+    rows: PyTree
+
+
+def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> Iterator[WindowBatch]:
+    """Yield windows as `take_windows` returns them: first those that are views, then the others."""
+    total, place = len(jax.tree.leaves(rows)[0]), np.arange(len(begin)) * length
+    views = int(np.sum((begin == place) & (place + length <= total)))
+    for which in (slice(views), slice(views, None)):
+        if len(first := begin[which]):
+            yield WindowBatch(which, first, take_windows(rows, first, length))
+
+
+def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
+    """Return windows of rows (n, length, ...), the last row repeated behind the end of the data.
+
+    They are views where they follow one another from the first row on and end within the data.
+
+    Args:
+        rows: arrays (rows, ...).
+        begin: number of the first row of each window (n,).
+        length: rows of a window.
+    """
+    total = len(jax.tree.leaves(rows)[0])
+    are_blocks = not np.any(begin % length) and bool(np.all(begin + length <= total))
+    are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
+
+    def take_from(leaf: np.ndarray) -> np.ndarray:
+        """Return the windows of one array: a view, blocks of rows, or copied one by one."""
+        if are_first_blocks:
+            return leaf[: len(begin) * length].reshape(len(begin), length, *leaf.shape[1:])
+        if are_blocks:
+            blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
+            return np.asarray(blocks[begin // length])
+        windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
+        for window, place in zip(windows, begin, strict=True):
+            part = leaf[place : place + length]
+            window[: len(part)] = part
+            window[len(part) :] = leaf[-1]
+        return windows
+
+    return jax.tree.map(take_from, rows)
+
+
+def run_and_join(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs: Sequence[bool]) -> PyTree:
+    """Return the results of runs of several lists of arguments in the same arrays; None without native code.
+
+    `differs` says of which arguments each run has its own.
+    """
+    choices = [choose_code(function, arguments, differs) for arguments in parts]
+    codes = [choice.code for choice in choices]
+    return None if None in codes else codes[0].compute_calls([choice.arrays for choice in choices])
+
+
+def take(states: PyTree, which: Which) -> PyTree:
+    """Return some entries, along the leading axis of every array."""
+    return jax.tree.map(lambda leaf: leaf[which], states)

@@ -1,0 +1,286 @@
+"""Run a filter over rows of data: one scan, and the estimates and innovations that it returns."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import ScanResult, filter_in_chunks
+from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.row_times import check_dates, find_common_dates
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.forecast_origin import KeptOrigin, Origin, find_usual_months, find_usual_spacing, last_input
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.linalg import find_not_finite
+from heliograph.numerics.module import readable
+from heliograph.numerics.times.data_row_checks import check_rows
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+
+Rows = np.ndarray  # an entry for each step along the first axis
+FEW = 10  # effective number of particles below which their moments say nothing
+
+
+class SteppedFilter(Protocol):
+    """Filter as a scan over rows reads it."""
+
+    @property
+    def claim(self) -> Claim:
+        """What the filter claims of its covariances."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of its inputs."""
+
+    @property
+    def received(self) -> int:
+        """Length of the filter's measurement z."""
+
+    @property
+    def horizon(self) -> int | None:
+        """Number of steps that it covers."""
+
+    def init(self) -> PyTree:
+        """Return the state before the first row."""
+
+    def predict(self, state: PyTree, u: ArrayLike, k: Array) -> PyTree:
+        """Return the prior of a row."""
+
+    def correct(self, state: PyTree, z: ArrayLike, k: Array) -> tuple[PyTree, Innovation]:
+        """Return the posterior of a row, and its innovation."""
+
+    def after_step(self, state: PyTree, k: Array) -> Estimate:
+        """Return the estimate of a row."""
+
+    def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
+        """Filter rows by native code of its own, None where it has none."""
+
+
+@readable
+@dataclass(frozen=True)
+class Filtered:
+    """Estimates and innovations of a filter over rows of data: row k is given the rows up to k.
+
+    Args:
+        means: posterior means (steps, n).
+        covariances: what is claimed of their errors (steps, n, n).
+        innovations: z - E[z | earlier rows] (steps, received), NaN for what did not arrive.
+        innovation_covariances: (steps, received, received).
+        log_likelihoods: log p(z_k | earlier rows) of each row (steps,), in nats.
+        claim: what the covariances are: "exact", "upper", "nominal" or "none".
+        weights: of each component in its update (steps, received), from 0 (left out) to 1 (in full); None of a filter
+            that weighs nothing.
+        origin: the state after the last row, from which `hg.forecast` predicts; None where it was not kept.
+        modes: probabilities of the modes (steps, M); None of a filter that weighs none.
+        effective_numbers: of particles after each row (steps,), 1 / sum of the squared weights; None of a filter
+            without particles of the state.
+    """
+
+    means: "Rows"
+    covariances: "Rows"
+    innovations: "Rows"
+    innovation_covariances: "Rows"
+    log_likelihoods: "Rows"
+    claim: "Claim"
+    weights: "Array | None" = None
+    origin: "KeptOrigin" = field(default=None, compare=False, repr=False)
+    modes: "Array | None" = None
+    effective_numbers: "Array | None" = None
+
+    @property
+    def log_likelihood(self) -> float:
+        """log p(z_1, z_2, ...): the sum over the rows."""
+        return float(np.sum(self.log_likelihoods))
+
+
+def scan_inside_jit(
+    filter: SteppedFilter,
+    z: Float[Array, "steps received"],
+    u: Float[Array, "steps inputs"],
+    output: Callable[[PyTree, Innovation, jax.Array], PyTree],
+) -> PyTree:
+    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of each, stacked."""
+    return scan_with_last_state(filter, z, u, output)[1]
+
+
+def scan_with_last_state(
+    filter: SteppedFilter,
+    z: Float[Array, "steps received"],
+    u: Float[Array, "steps inputs"],
+    output: Callable[[PyTree, Innovation, jax.Array], PyTree],
+    state: PyTree | None = None,
+    begin: Array | int = 0,
+) -> tuple[PyTree, PyTree]:
+    """Step a filter over rows; return its state after the last row, and the outputs of all rows, stacked.
+
+    Args:
+        filter: the filter.
+        z: measurements, NaN for what did not arrive.
+        u: inputs.
+        output: what is kept of a row, of its state after the row, its innovation and the row's number k.
+        state: before the first row; by default that before any data.
+        begin: number of the first row.
+    """
+
+    # A derivative backwards keeps of each row the state before it, say 17 numbers, and computes the row again. To keep
+    # all some 540 numbers of the row takes longer, as they are stored and read.
+    @partial(jax.checkpoint, prevent_cse=False)
+    def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
+        k, z_k, u_k = row
+        after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
+        return after, output(after, innovation, k)
+
+    start = jax.tree.map(jnp.asarray, filter.init() if state is None else state)
+    numbers = jnp.asarray(begin) + jnp.arange(len(z))
+    last, outputs = jax.lax.scan(step, start, (numbers, jnp.asarray(z), jnp.asarray(u)))
+    return last, outputs
+
+
+def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, after: Filtered | None = None) -> Filtered:
+    """Run a filter over rows of data, by native code where the filter has it; return estimates and innovations.
+
+    Args:
+        filter: the filter.
+        z: measurements (rows, received), an array or a table; NaN for what did not arrive.
+        u: inputs (rows, inputs); None of a filter without any.
+        after: result of the rows before these, from whose last state the filter goes on; None for the first rows.
+    """
+    before = None if after is None else _find_origin_of_earlier_result(filter, after)
+    begin = 0 if before is None else int(before.step)
+    rows_z, rows_u = check_data(filter, z, u, begin)
+    dates = find_common_dates(_name_tables(z, u))
+    dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
+    if before is not None and dates is not None:
+        _check_dates_increase(before, dates)
+    start = () if before is None else (before.state, np.asarray(begin))
+    # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
+    # return None where they do not apply.
+    result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)
+    result = result or filter.filter_rows(rows_z, rows_u, *start)
+    state, outputs = result or compute_once(_compute_filtered, _by_xla, (filter, rows_z, rows_u, *start))
+    mean, covariance, innovation, modes, counts = outputs
+    _warn_of_lost_estimate(filter, mean, begin)
+    if counts is not None:
+        _warn_of_few_particles(counts, innovation.log_likelihood, begin)
+    return Filtered(
+        means=mean,
+        covariances=covariance,
+        innovations=innovation.value,
+        innovation_covariances=innovation.covariance,
+        log_likelihoods=innovation.log_likelihood,
+        claim=filter.claim,
+        weights=innovation.weight,
+        origin=_make_end_origin(filter, state, begin + len(rows_z), rows_u, dates),
+        modes=modes,
+        effective_numbers=counts,
+    )
+
+
+def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
+    """Return where a record ends, from which a later call or a forecast goes on.
+
+    Args:
+        filter: the filter.
+        state: its state after the last row.
+        end: number of the row after the last one.
+        u: inputs (rows, inputs).
+        dates: of the rows; None where they have none, and their numbers are their times.
+    """
+    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_usual_spacing(dates))
+    months = 0 if dates is None else find_usual_months(dates)
+    return Origin(
+        model=filter,
+        state=state,
+        step=end,
+        inputs=last_input(np.asarray(u)),
+        time=last_time,
+        spacing=spacing,
+        months=months,
+    )
+
+
+def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) -> None:
+    """Warn where means (rows, n) are no finite numbers, from which row on; `begin` rows were before."""
+    lost = find_not_finite(mean, 1)
+    if lost.any():
+        row = begin + int(np.argmax(lost)) + 1
+        said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
+        warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=4)
+
+
+def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
+    """Return where an earlier result of this filter ended; raise ValueError unless it is one, with its last state."""
+    expected = "what `run` of this filter returned for the rows before"
+    origin = instance("after", after, Filtered, expected).origin
+    if origin is None:
+        raise fail("after", expected, "a result without the state after its last row")
+    if not isinstance(origin.model, type(filter)) or not origin.has_form_of(filter.init()):
+        raise fail("after", expected, f"one of another filter, {type(origin.model).__name__}")
+    return origin
+
+
+def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
+    """Check that dates of rows are behind that of the last row before them, where it has one."""
+    if isinstance(before.time, np.datetime64) and not dates[0] > before.time:
+        raise fail("measurements", f"rows behind {before.time}, the last one before them", str(dates[0]))
+
+
+def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
+    """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before."""
+    unused = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
+    few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
+    if len(unused):
+        said = f"particle_filter: {len(unused)} of the rows are not used, first row {unused[0]}"
+        warnings.warn(f"{said}: no particle explains what arrived, and the state stays as it was", stacklevel=4)
+    if len(few):
+        least = float(np.min(np.asarray(counts)))
+        said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0]}"
+        warnings.warn(f"{said} ({least:.2g} at least); take more of them", stacklevel=4)
+
+
+def _compute_filtered(
+    filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
+) -> PyTree:
+    """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
+    return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
+
+
+def _collect_row_results(filter: SteppedFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> PyTree:
+    """Return what is kept of a row: mean, covariance, innovation, probabilities of modes, number of particles."""
+    estimate = filter.after_step(state, k)
+    return estimate.mean, estimate.covariance, innovation, estimate.modes, getattr(state, "effective_number", None)
+
+
+_by_xla = quickly_compiled(_compute_filtered)
+
+
+def check_data(
+    filter: SteppedFilter, measurements: ArrayLike, inputs: ArrayLike | None, begin: int = 0
+) -> tuple[Float[Array, "steps received"], Float[Array, "steps inputs"]]:
+    """Return measurements and inputs of a filter as arrays of rows; without inputs the filter must take none.
+
+    Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
+    `begin` rows were before them.
+    """
+    check_dates(filter.inputs, _name_tables(measurements, inputs))
+    z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
+    z = z if filter.received else z[:, :0]
+    # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.
+    given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
+    u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False, names=filter.inputs)
+    check_inputs(filter.inputs, u, filter)
+    if filter.horizon is not None and begin + len(z) > filter.horizon:
+        raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", begin + len(z))
+    return z, u
+
+
+def _name_tables(measurements: object, inputs: object) -> dict[str, object]:
+    """Return the tables of a call by the names that errors use."""
+    return {"measurements": measurements, "inputs": inputs}

@@ -1,0 +1,190 @@
+"""Linear filters behind words: the same filter of numbers about the centres of the words' range."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    Step,
+    corrects,
+    make_sizes,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.words.bit_likelihoods import list_told_modes
+from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.channel import Channel, check_sent
+from heliograph.model.estimate import Claim, Innovation, lower_by_noise, weakest
+from heliograph.model.over_time import at_each_step, first, unstack
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.model.words.encoder import Words
+from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rounded_noises
+
+SEEN = 0.01  # share of the rms error that overload may change a claim by
+MakeFilter = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
+
+
+class LinearWordsFilter(AbstractWrapper):
+    """A linear filter of the numbers z = q' - c - E[g] d, with q' the received words and d the dithers to take off.
+
+    Of a number that is no word nothing is taken, nor of words whose dither is to be taken off by a mode that nobody
+    told.
+
+    Args:
+        base: the filter of z.
+        centres: c of each output of the channel, 0 of a flag.
+        gains: E[g] of each word whose dither is taken off, of each mode that is told (modes, words); none without.
+        words: outputs that are words.
+        flag: output at which the mode is told on which gains depend; None without one.
+        overload: of the words, before any data.
+    """
+
+    base: AbstractFilter
+    centres: Array
+    gains: Array
+    words: tuple[int, ...] = eqx.field(static=True)
+    flag: int | None = eqx.field(static=True)
+    overload: Overload
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct with the words that arrived, as numbers."""
+        after, innovation = self.base.correct(state, self._convert_words_to_numbers(jnp.asarray(z)), k)
+        # Dithers have no innovation.
+        dithers = self.received - len(self.centres)
+        value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(dithers, jnp.nan)])
+        covariance = jnp.pad(innovation.covariance, ((0, dithers), (0, dithers)), constant_values=jnp.nan)
+        return after, Innovation(value, covariance, innovation.log_likelihood)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of the filter of the numbers."""
+        return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
+
+    def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
+        """Return q' - c - E[g] d of the received words and dithers, E[g] of the mode that was told."""
+        values = z[: len(self.centres)] - jnp.asarray(self.centres)
+        if self.received == len(self.centres):
+            return values
+        gains = jnp.asarray(self.gains)
+        if self.flag is None:
+            gain = gains[0]
+        else:
+            mode = z[self.flag]
+            gain = jnp.where(mode == jnp.arange(len(gains)), 1.0, 0.0) @ gains
+            gain = jnp.where(jnp.isnan(mode), jnp.nan, gain)
+        return values.at[np.array(self.words)].add(-gain * z[len(self.centres) :])
+
+
+def build_behind_words(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, encoder: Words, make: MakeFilter
+) -> LinearWordsFilter:
+    """Return a linear filter of words, which is one of the numbers that they stand for about the centres of the range.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor, whose outputs are sent as words.
+        channel: of words.
+        encoder: the words.
+        make: builds a linear filter of numbers, of a plant, a sensor and a channel.
+
+    Raises:
+        ValueError: words that do not fit, a dither that is not known behind a link that remembers, a range that is
+            overloaded more often than once in a thousand steps.
+    """
+    start = check_plant(plant)
+    check_linear("linear filter", plant, sensor)
+    outputs = len(first(sensor).outputs)
+    instance("encoder", encoder, Words, "Words").check_outputs(outputs)
+    check_sent(first(sensor), first(channel))
+    places, numbers = find_places(channel), rewrite_about_centres(encoder, channel)
+    # Laws of the words as numbers: of each mode where modes arrive with them, of each step else.
+    told_modes = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    laws = [first(law) for law in told_modes or unstack(numbers)]
+    # Whether the words' gain as numbers is random, given the mode where it is told: as where bits flip.
+    remembers = first(channel).remembers
+    fades = (remembers and not told_modes) or any(has_random_gain(law, second_order(law)) for law in laws)
+    _check_rounding(sensor, encoder, remembers and fades)
+    # The sensor of y - c with rounding, and the filter of numbers behind it.
+    # Whether the rounding of a Gaussian y is described exactly; filters of modes, and of past signals, use bounds.
+    gaussian = _is_gaussian(plant, sensor) and not first(channel).past and not remembers
+    rounded = at_each_step(lambda of_step: _add_rounding_noise(of_step, encoder, gaussian, fades), sensor)
+    base = make(plant, rounded, numbers)
+    overload = bound_overload(plant, rounded, numbers, encoder, places)
+    refuse_overload(overload)
+    words = tuple(i for i, place in enumerate(places) if place != FLAG)  # rows of z that are words
+    centres = np.array([0.0 if place == FLAG else encoder.each(encoder.centre, outputs)[place] for place in places])
+    gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
+    # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
+    claim_of_delay: Claim = "upper" if first(channel).past else "exact"
+    claim = weakest([lower_by_noise(base.claim, rounded), claim_of_delay, _claim_despite_overload(overload)])
+    return LinearWordsFilter(
+        base=base,
+        centres=centres,
+        gains=gains,
+        words=words,
+        flag=len(places) - 1 if told_modes else None,
+        overload=overload,
+        **make_sizes(claim, start, len(places) + gains.shape[1]),
+    )
+
+
+def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) -> None:
+    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already."""
+    if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
+        expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
+        raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
+    if find_rounded_noises(sensor):
+        raise fail(
+            "sensor of a node with an encoder", "one without resolution, as words have their own", "a resolution"
+        )
+
+
+def _claim_despite_overload(overload: Overload) -> Claim:
+    """Return "exact" where overload changes the rms error by 1 % at most, else "nominal"."""
+    return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
+
+
+def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
+    """Return the sensor of y - c whose noise has the error of rounding."""
+    m = len(sensor.outputs)
+    step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
+    noise = RoundedNoise(
+        source=sensor.noise,
+        step=step,
+        half=high - centre,
+        centre=centre,
+        dither=encoder.dither,
+        gaussian=gaussian,
+        matters=matters,
+    )
+    return LinearSensor(sensor.matrix, noise, sensor.outputs)
+
+
+def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
+    """Return the mean gain of each word in each mode, (modes, words)."""
+    return np.stack([_mean_gains(law)[list(words)] for law in laws])
+
+
+def _mean_gains(numbers: Channel) -> np.ndarray:
+    """Return E[g] of each output of a channel of numbers: its row sums, as each output carries one word."""
+    steps = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(numbers)]
+    if any(not np.array_equal(step, steps[0]) for step in steps):
+        raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
+    return np.asarray(steps[0])
+
+
+def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
+    """Return whether what the sensor measures is Gaussian before any data."""
+    laws: list[object] = [first(plant).deviation]
+    laws += [step.noise for step in unstack(plant)] + [step.noise for step in unstack(sensor)]
+    return all(isinstance(law, Gaussian) for law in laws if isinstance(law, AbstractNoise))

@@ -1,0 +1,171 @@
+"""Bound on the mean covariance of a filter over the numbers that its links may tell it, before any are drawn.
+
+Told numbers come with a message and say what the link did to it, such as its gain or a reading of that.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.factored_gaussian import from_covariance
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.linear.linear_filter_state import LinearBelief
+from heliograph.filters.wrappers.told_link_law import ToldFilter
+from heliograph.model.over_time import first
+from heliograph.numerics.check import check_count, fail, show_value
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.times.data_row_checks import check_rows
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.channel_state_information import FreshNumbers, FreshReading, list_told_maps
+from heliograph.random_affine.laws.gain_given_reading import gain_quadrature, reading_quadrature
+from heliograph.random_affine.laws.law import AbstractLaw
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, MarkovChain
+from heliograph.random_affine.noise import FiniteSupport
+
+MOST = 20_000  # combinations of numbers that are summed over
+
+
+# Of a step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
+Carry = tuple[LinearBelief, jax.Array, jax.Array]
+
+
+class ToldNumbersByMode(NamedTuple):
+    """Numbers that may be told at a step, by mode of the chain that tells them; one mode where they are fresh.
+
+    Shapes: numbers (modes, nodes, told), weights (modes, nodes) that sum to 1 in each mode, initial (modes,),
+    transition (modes, modes).
+    """
+
+    numbers: Float[np.ndarray, "modes nodes told"]
+    weights: Float[np.ndarray, "modes nodes"]
+    initial: Float[np.ndarray, " modes"]
+    transition: Float[np.ndarray, "modes modes"]
+
+
+def mean_error_bound(
+    filter: AbstractFilter, steps: int, inputs: "Float[ArrayLike, 'steps inputs'] | None" = None
+) -> Float[np.ndarray, "steps n n"]:
+    """Bound the mean over all that may be told of a filter's covariance, at each step and before any data.
+
+    What is left of a covariance P after a message with numbers a, f(P, a), is concave and increasing in P. So
+    V+ = E f(V, a) over numbers that are drawn anew each step is at least E P+, and at most what the filter of the law
+    alone claims. For numbers of a Markov chain, V+_j = f(sum_i b_ij V_i, a_j) in mode j, b_ij = P(i before | j now).
+    Means over gains with a density are sums over Gauss's nodes. A message is taken to arrive at each step.
+
+    Args:
+        filter: a `linear_filter` behind a link that tells gains, readings of gains, or numbers of finitely many values
+            or of one gain's law.
+        steps: how many.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Claim: "upper".
+
+    Raises:
+        ValueError: another filter, numbers without a law or with another one, inputs of another size.
+    Source: Jensen's inequality.
+    """
+    check_count("steps", steps)
+    if not (isinstance(filter, ToldFilter) and isinstance(filter.base, LinearFilter)):
+        got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
+        raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)
+    given = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
+    u = check_rows("inputs", given, steps, len(filter.inputs), missing=False)
+    return np.asarray(_bound_mean_covariance(filter, _list_told_numbers(filter), np.asarray(u)))
+
+
+@compile_in_float64
+def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array) -> jax.Array:
+    """Return the bound on the mean covariance at each step (steps, n, n): compiled body of `mean_error_bound`.
+
+    In mode j of the chain that tells numbers, V+_j = sum_a P(a | j) f(sum_i b_ij V_i, a): f(P, a) is what is left of a
+    covariance P after a step with the message a, b_ij = P(i before | j now). The output is sum_j P(j) V+_j.
+
+    Args:
+        filter: of a linear filter, told numbers with each message.
+        told: the numbers that each mode may tell, and the chain.
+        u: inputs (steps, inputs).
+    """
+    start = filter.init()
+    modes = len(told.initial)
+
+    def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
+        """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero."""
+        z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
+        after: LinearBelief = filter.correct(prior, z, k)[0]
+        covariance: jax.Array = after.gaussian.covariance
+        return covariance
+
+    def bound_step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
+        """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
+        state, before, law = carry
+        k, u_k = row
+
+        def step_in_mode(
+            covariance: jax.Array, numbers: jax.Array, weights: jax.Array
+        ) -> tuple[LinearBelief, jax.Array]:
+            """Return the prediction, and the mean covariance after it over the numbers that this mode may tell."""
+            gaussian = from_covariance(state.gaussian.mean, covariance)
+            prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
+            after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
+            return prior, jnp.tensordot(weights, after, 1)
+
+        priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(told.numbers), jnp.asarray(told.weights))
+        # V of each mode of the next step: the mean over the modes that may come before it.
+        next_law = law @ told.transition
+        back = law[:, None] * told.transition / jnp.where(next_law > 0, next_law, 1.0)  # P(i now | j next)
+        mixed = jnp.einsum("ij,iab->jab", back, after)
+        # All modes share the moments of the plant's state, so that one of their predictions goes on.
+        return (jax.tree.map(lambda leaf: leaf[0], priors), mixed, next_law), jnp.tensordot(law, after, 1)
+
+    covariances = jnp.broadcast_to(start.gaussian.covariance, (modes, *start.gaussian.covariance.shape))
+    carry = jax.tree.map(jnp.asarray, start), covariances, jnp.asarray(told.initial)
+    covariances_over_time: jax.Array = jax.lax.scan(bound_step, carry, (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    return covariances_over_time
+
+
+def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
+    """Return the numbers that a message may tell, with their probabilities, by mode of the chain that tells them.
+
+    A chain tells its mode, one number in each. Numbers that are drawn anew at each step have one mode, in which all
+    combinations over the maps that tell some may come.
+    """
+    memories = [affine.memory for affine in list_told_maps(first(filter.link))]
+    chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
+    if chains:
+        varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step
+        if len(memories) > 1 or chains[0].is_uncertain or varies:
+            raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
+        modes = chains[0].modes
+        numbers = np.arange(float(modes))[:, None, None]
+        return ToldNumbersByMode(
+            numbers=numbers,
+            weights=np.ones((modes, 1)),
+            initial=np.asarray(chains[0].initial),
+            transition=np.asarray(chains[0].transition),
+        )
+    # All combinations so far with each number of the next map.
+    values, weights = np.zeros((1, 0)), np.ones(1)
+    for memory in memories:
+        more, chances = _find_quadrature(memory)
+        if len(values) * len(more) > MOST:
+            raise fail("numbers told", f"at most {MOST} combinations of nodes", len(values) * len(more))
+        values = np.concatenate([np.repeat(values, len(more), axis=0), np.tile(more, (len(values), 1))], axis=1)
+        weights = np.outer(weights, chances).ravel()
+    return ToldNumbersByMode(
+        numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1))
+    )
+
+
+def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
+    """Return numbers that are drawn anew at each step, with their probabilities."""
+    if isinstance(memory, FreshReading):
+        return reading_quadrature(memory.law, float(memory.variance))
+    if isinstance(memory, FreshNumbers) and isinstance(memory.law, AbstractLaw) and memory.count == 1:
+        return gain_quadrature(memory.law)
+    if isinstance(memory, FreshNumbers) and isinstance(memory.law, FiniteSupport):
+        return np.asarray(memory.law.atoms), np.asarray(memory.law.probabilities)
+    law = memory.law if isinstance(memory, FreshNumbers) else memory
+    raise fail("numbers told", "a law of one gain or of finitely many values", type(law).__name__)

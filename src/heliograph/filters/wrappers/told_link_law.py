@@ -1,0 +1,256 @@
+"""Filters of links whose law is told with each message: for each the filter of the law that its numbers give.
+
+Told numbers come with a message and say what the link did to it, such as its gain; a law is that of gain and noise.
+"""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import (
+    AbstractFilter,
+    FilterAngles,
+    Step,
+    corrects,
+    make_sizes,
+)
+from heliograph.filters.smoother_step import SmootherStep, StepTrace
+from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Innovation, weakest
+from heliograph.model.over_time import at, at_each_step, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.premises.premise import on_premise
+from heliograph.model.reported_numbers import separate_told
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import ArrayLike, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.channel_state_information import (
+    condition_on_told_numbers,
+    list_told_maps,
+    list_told_numbers_of_outputs,
+    make_laws_certain,
+    numbers_give_law,
+)
+from heliograph.random_affine.moments.second_moments import second_order
+
+ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
+
+F = TypeVar("F", bound=AbstractFilter)
+P = ParamSpec("P")
+
+
+class FilterMaker(Module):
+    """A function that makes a filter, with all of its arguments but plant, sensor and channel."""
+
+    function: Callable[..., AbstractFilter] = eqx.field(static=True)
+    arguments: dict[str, object]
+
+    def __call__(self, plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
+        """Make the filter of these three."""
+        return self.function(plant=plant, sensor=sensor, channel=channel, **self.arguments)
+
+
+class ToldFilter(AbstractWrapper):
+    """The filter that `make` builds, for each message behind the link whose law its numbers give.
+
+    Between messages all such filters are one: how a state moves depends on the plant, not on the link. A value is not
+    used where a number is missing that tells of its own link, but for a pilot: without a reading the gain has its law.
+
+    Args:
+        base: the filter for typical numbers, which predicts.
+        plant: the plant.
+        sensor: its sensor.
+        link: the channel without what is told.
+        make: builds a filter of plant, sensor and a link.
+        values: rows of z in which the link's values stand.
+        numbers: rows in which what is told stands.
+    """
+
+    base: AbstractFilter
+    plant: AnyPlant
+    sensor: AnySensor
+    link: Channel
+    make: FilterMaker
+    values: tuple[int, ...] = eqx.field(static=True)
+    numbers: tuple[int, ...] = eqx.field(static=True)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Correct by the filter of the law that the numbers of the message give."""
+        values, numbers = self._split_message(jnp.asarray(z))
+        filter, is_law = self._make_filter_given(numbers, k)
+        after, innovation = filter.correct(state, values, k)
+        # Numbers that give no law make the state NaN, so that the message is refused where it came in.
+        after = _spoil_state(after, ~is_law & ~jnp.all(jnp.isnan(values)))
+        return after, self._place_innovation(innovation)
+
+    def _place_innovation(self, innovation: Innovation) -> Innovation:
+        """Return the innovation of the values at their rows of z.
+
+        What is told is no measurement: like what did not arrive it is NaN in the innovation, and counts for no test.
+        """
+        received, rows = len(self.values) + len(self.numbers), np.array(self.values)
+        value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
+        covariance = jnp.full((received, received), jnp.nan)
+        covariance = covariance.at[rows[:, None], rows].set(innovation.covariance)
+        weight = innovation.weight
+        if weight is not None:
+            weight = jnp.full(received, jnp.nan).at[rows].set(weight)
+        return Innovation(value, covariance, innovation.log_likelihood, weight)
+
+    def smoother_step(self, step: StepTrace) -> SmootherStep:
+        """Return the smoother step of the filter of the law that was told."""
+        values, numbers = self._split_message(jnp.asarray(step.z))
+        filter, _ = self._make_filter_given(numbers, step.k)
+        return filter.smoother_step(step._replace(z=values))
+
+    @property
+    def attitude(self) -> Angles:
+        """Return the places of attitudes among the states of the filter within."""
+        return self.base.attitude
+
+    def angles_used(self) -> FilterAngles | None:
+        """Return the angles of the filter within, at their rows; what is told is none."""
+        angles = self.base.angles_used()
+        return angles and angles._replace(received=tuple(self.values[i] for i in angles.received))
+
+    @property
+    def knows_gain(self) -> bool:
+        """True if no gain is random given what is told, so that innovations of a Gaussian world are independent."""
+        link = believe_typical(first(self.link))
+        if link.remembers:
+            return False
+        moments = second_order(link)
+        size = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
+        return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * size**2))
+
+    def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":
+        """Return the filter of another plant, sensor and link, told the same numbers; of the same claim."""
+        base = self.make(plant, sensor, at_each_step(believe_typical, link))
+        sizes = make_sizes(self.claim, base, self.received)
+        return ToldFilter(
+            base=base,
+            plant=plant,
+            sensor=sensor,
+            link=link,
+            make=self.make,
+            values=self.values,
+            numbers=self.numbers,
+            **sizes,
+        )
+
+    def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return values and numbers of a message; no value where a number is missing that it needs."""
+        numbers = z[np.array(self.numbers)]
+        suffices = ~jnp.isnan(numbers) | self._may_be_missing
+        is_usable = jnp.all(suffices | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
+        return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
+
+    @property
+    def _may_be_missing(self) -> jax.Array:
+        """True for the numbers that may be missing, of all that are told (numbers,)."""
+        return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in list_told_maps(first(self.link))])
+
+    def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
+        """Build the filter of the law that the numbers give, and tell whether they give one.
+
+        Where a number is missing that must not, it is that of a typical law.
+        """
+        link = at(self.link, k)
+        typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
+        complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
+        return self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete)), numbers_give_law(
+            link, complete
+        )
+
+
+def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
+    """Return a state with all its real numbers NaN where `spoilt`, else as it is."""
+
+    def spoil(leaf: jax.Array) -> jax.Array:
+        """Return NaN in place of real numbers where the state is spoilt."""
+        is_real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.where(spoilt, jnp.nan, leaf) if is_real else leaf
+
+    return jax.tree.map(spoil, state)
+
+
+def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: FilterMaker) -> ToldFilter:
+    """Return the filter behind a channel that delivers with z the numbers that give its link's law (told numbers).
+
+    Args:
+        plant: the plant.
+        sensor: its sensor.
+        channel: a channel that delivers numbers after z; it may vary over time.
+        make: builds a filter of plant, sensor and a link of known law.
+
+    Claim: that of the filter for typical numbers; "nominal" where the numbers depend on the state, or leave open
+    what is not drawn anew with each message.
+    """
+    # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
+    # prediction depends on them.
+    link = at_each_step(lambda channel: make_laws_certain(separate_told(channel).link), channel)
+    base = make(plant, sensor, at_each_step(believe_typical, link))
+    claim = base.claim
+    if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
+        claim = weakest([claim, "nominal"])
+    # Rows of z in which the link's values and the told numbers stand.
+    _, values, numbers = separate_told(first(channel))
+    filter = ToldFilter(
+        base=base,
+        plant=plant,
+        sensor=sensor,
+        link=link,
+        make=make,
+        values=values,
+        numbers=numbers,
+        **make_sizes(claim, base, len(values) + len(numbers)),
+    )
+    premise = base.premise
+    return on_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
+
+
+@in_float64
+def believe_typical(link: PyTree) -> PyTree:
+    """Return a link as it is for typical numbers."""
+    typical = [affine.typical for affine in list_told_maps(link)]
+    return condition_on_told_numbers(link, library(typical).concatenate(typical))
+
+
+def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take channels that report numbers of their law with each message.
+
+    Behind such a channel the function then makes a `ToldFilter`, which reads the numbers (they are told) and corrects
+    with a filter of the law that they give. To a type checker the function returns what it returned before: behind any
+    other channel it does.
+
+    Args:
+        make: a function of a plant, a sensor, a channel, and more.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build_with_told(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
+        given = parameters.bind(*args, **kwargs).arguments
+        channel = given.get("channel")
+        # What is no channel reports nothing, and is for `make` to refuse.
+        is_channel = isinstance(first(channel), AbstractRandomAffine)
+        reports_numbers = is_channel and len(separate_told(first(channel)).numbers) > 0
+        if not reports_numbers:
+            return make(*args, **kwargs)
+        plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
+        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
+
+    return build_with_told

@@ -1,0 +1,285 @@
+"""Fusion of all reports that have reached the centre: a Kalman filter of the state and of all nodes' errors."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import (
+    WeightedColumns,
+    columns_of,
+    eliminate,
+    join_columns,
+    noise_beside_repeated,
+    rounding_of,
+    square_root,
+)
+from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
+from heliograph.filters.gaussian.signal_moments import augmented_second_moment
+from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
+from heliograph.fusion.quantizer import widen_by_quantization
+from heliograph.fusion.report_link import ReportModel
+from heliograph.fusion.rules import Fused, Means
+from heliograph.linear.jump_system import propagate_by_mode
+from heliograph.numerics.linalg import symmetric
+from heliograph.numerics.types import Array, Bool, Float
+
+
+class PastReports(NamedTuple):
+    """Reports sent 0, 1, ... steps ago: mean gain, offset, mean noise Cov(z | sent), and the quantizers' error.
+
+    Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
+    """
+
+    gain: jax.Array
+    offset: jax.Array
+    noise: jax.Array
+    error: jax.Array
+
+
+class ReportsBelief(NamedTuple):
+    """Estimate of the centre, of zeta = (x, e_1, ..., e_nodes, reports sent one step ago, two steps ago, ...).
+
+    `gaussian` has N = (1 + nodes + nodes delays) n components; `spill` bounds the square of the part of the error that
+    comes from quantizers: the error of the mean is one of this covariance plus one within that bound.
+    """
+
+    gaussian: Gaussian
+    past: PastReports
+    spill: Float[jax.Array, "N N"] | None
+
+
+class AllReports(AbstractInformedFusion):
+    """A Kalman filter of the plant and of every node's error, whose measurements are the reports x - e_i, with memory.
+
+    Where every report arrives it equals the central filter if every gain has full column rank: the centre could
+    recompute each measurement. It uses more information than weights of the present estimates, at the price of a state
+    of all errors.
+
+    Reports that fade, get lost or are late (`ReportLink`), or are quantized, are modelled as such; a late report is one
+    of the past estimate, which is a state for as long as it may arrive.
+
+    Claim: as `MatrixWeights`; behind quantizers what these leave of it. Refused where the
+    centre cannot know the nodes' gains: nodes that lose measurements behind links that may lack their report.
+
+    Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
+    """
+
+    @property
+    def uses_reports(self) -> bool:
+        """True: it uses reports that fade, are late, or never arrive."""
+        return True
+
+    def start(self, errors: ErrorMoments) -> ReportsBelief:
+        """Return the state before the first report, over lossless links."""
+        return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
+
+    def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
+        """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive."""
+        nodes, n = means.shape
+        prior = propagate_errors(state, happened, make_lossless_links(nodes, n))
+        # The means are the reports, all of age 0.
+        after, _ = correct_with_reports(prior, jnp.asarray(means)[None])
+        return after, estimate_state(after, n)
+
+
+def make_lossless_links(nodes: int, n: int) -> ReportModel:
+    """Return the model of links that deliver what is sent, unchanged and at once."""
+    zero = np.zeros((nodes, n))
+    return ReportModel(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
+
+
+def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
+    """Return the state before the first report, for so many `delays` and `received` numbers per report.
+
+    Every error is that of x_0 then, up to a constant; nothing has been sent.
+    """
+    nodes, n = errors.bias.shape
+    padding = (0, nodes * n * delays)  # zeros for past reports
+    start = columns_of(errors.state_covariance)
+    root = jnp.pad(jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1)), (padding, (0, 0)))
+    mean = jnp.pad(errors.mean.reshape(-1), padding)
+    shapes = (received, n), (received,), (received, received), (n,)
+    past = PastReports(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
+    spill = jnp.zeros((len(mean), len(mean))) if quantized else None
+    return ReportsBelief(from_columns(mean, WeightedColumns(root, start.weights)), past, spill)
+
+
+class ReportMap(NamedTuple):
+    """Linear map of (zeta, reports sent one step ago, two steps ago, ...); `F @ columns` applies it.
+
+    It moves zeta by its step, puts the reports x - e_i of the step before in front of the past ones, and drops the
+    oldest.
+    """
+
+    transition: ErrorMap
+
+    def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
+        """Move zeta by its step, and past reports by one place."""
+        nodes, n, _ = self.transition.errors.shape
+        zeta, past = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
+        moved = self.transition @ zeta
+        if not len(past):
+            return moved
+        sent = jnp.concatenate([zeta[:n]] * nodes) - zeta[n:]
+        return jnp.concatenate([moved, sent, past[: -nodes * n]])
+
+
+def propagate_errors(state: ReportsBelief, happened: CentreStep, links: ReportModel) -> ReportsBelief:
+    """Predict zeta+ = F zeta + f + B w - K nu; then each node sends x - e_i."""
+    step, errors = happened
+    nodes, n, _ = step.gain.shape
+    length, size = len(state.gaussian.mean), len(step.shift)  # of the state with past reports, and of zeta
+    # Noise: w is common to all, nu enters by each node's gain; estimates are known to the rounding of x.
+    noise = join_columns(
+        columns_of(step.process).through(step.of_noise),
+        _factor_measurement_noise(step.gain, step.received).through(np.eye(size, nodes * n, -n)),
+        rounding_of(jnp.tile(_find_second_moments_of_state(errors), 1 + nodes)),
+    )
+    # Past reports move on by one place, without a noise.
+    line = ReportMap(step.transition)
+    shift, noise = jnp.pad(step.shift, (0, length - size)), noise.through(np.eye(length, size))
+    spill = None if state.spill is None else symmetric(propagate_by_mode(line, state.spill, 0.0))
+    return ReportsBelief(
+        predict_affine(state.gaussian, line, shift, noise), _prepend_present_reports(state.past, errors, links), spill
+    )
+
+
+def _find_second_moments_of_state(errors: ErrorMoments) -> Float[jax.Array, " n"]:
+    """Return E[x_i^2] of each component of the plant's state, before any data (n,)."""
+    return jnp.asarray(errors.state_mean**2 + jnp.diagonal(errors.state_covariance))
+
+
+class PredictedReports(NamedTuple):
+    """Predicted mean of the reports, (age, node, m) flattened, and their innovation covariance."""
+
+    mean: Float[jax.Array, " M"]
+    covariance: Float[jax.Array, "M M"]
+
+
+def correct_with_reports(
+    state: ReportsBelief, reports: Float[jax.Array, "age node m"]
+) -> tuple[ReportsBelief, PredictedReports]:
+    """Correct with the reports that arrived, by their age in steps; NaN for those that did not arrive now.
+
+    With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
+    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`; O maps the state to
+    the reports, n is their noise. A report that earlier ones determine is measured again, with slopes O root that are
+    rounding: K takes an eps of its variance for noise, so that K times these slopes is an eps too.
+
+    Returns:
+        The state after, and the law of the reports before they arrived.
+    """
+    x, past, values = state.gaussian, state.past, jnp.ravel(reports)
+    output, offset = _make_output_matrix(past, len(x.mean)), jnp.ravel(past.offset)
+    expected, present, noise = output @ x.mean + offset, ~jnp.isnan(values), _factor_each(past.noise)
+    gain, unexpected = _compute_gain(x, output, past, present), jnp.where(present, values - expected, 0.0)
+    slopes = jnp.asarray(output @ x.root)
+    after = correct_by_gain(x, slopes, noise, gain, unexpected)
+    # The errors mu themselves enter the bound (Young, Cauchy).
+    spill = None
+    if state.spill is not None:
+        keep = jnp.eye(len(x.mean)) - gain @ output
+        push = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+        spill = symmetric(_bound_by_young(propagate_by_mode(keep, state.spill, 0.0), push))
+    law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
+    return ReportsBelief(after, past, spill), law
+
+
+def _compute_gain(
+    x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
+) -> Float[jax.Array, "N M"]:
+    """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report."""
+    one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
+    quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
+    noise = past.noise + quantized + one * noise_beside_repeated(terms)[..., None]
+    # What did not arrive has slopes of zero and a noise of its own.
+    arrived = present.reshape(shape)
+    noise = jnp.where(arrived[..., :, None] & arrived[..., None, :], noise, one)
+    slopes = jnp.where(present[:, None], output @ x.root, 0.0)
+    return jnp.where(present, gain_of(x, slopes, _factor_each(noise)), 0.0)
+
+
+def estimate_state(state: ReportsBelief, n: int) -> Fused:
+    """Return the estimate of x, with the covariance of its error or a bound on it."""
+    x = take_leading(state.gaussian, n)
+    mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
+    return mean, covariance if state.spill is None else _bound_by_young(covariance, state.spill[:n, :n])
+
+
+def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: ReportModel) -> PastReports:
+    """Put the present reports before those of earlier steps, and drop the oldest."""
+    mean = errors.state_mean - errors.bias
+    blocks = jnp.einsum("iaib->iab", errors.joint)
+    # E m m' of each node's estimate m = x - e, by the covariances of x and e and of both.
+    cross = errors.with_state + jnp.swapaxes(errors.with_state, 1, 2)
+    second = errors.state_covariance - cross + blocks + mean[:, :, None] * mean[:, None]
+    # Second moments of what is sent, of (m_i, 1), with the quantizers' error.
+    error = jnp.asarray(links.error)
+    sent = jax.vmap(lambda s, m: augmented_second_moment(s, m, 1.0))(second, mean)
+    sent = jax.vmap(widen_by_quantization)(sent, jnp.pad(error, ((0, 0), (0, 1))))
+    # Noise of the reports: the spread of the links on what is sent. A link without spread adds none, whatever is sent,
+    # also where the moments of that are unknown: along the estimates of one run.
+    has_spread = jnp.any(jnp.asarray(links.spread) != 0, axis=(1, 2, 3, 4))
+    noise = jnp.einsum("iabcd,icd->iab", links.spread, jnp.where(has_spread[:, None, None], sent, 0.0))
+    present = PastReports(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
+    return PastReports(*(jnp.concatenate([new[None], old[:-1]]) for new, old in zip(present, past, strict=True)))
+
+
+def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
+    """Return C of E[reports] = C s for the state s = (x, e_1, ..., e_nodes, what was sent 1, 2, ... steps before).
+
+    A report that was sent a steps before is its mean gain times x - e_i for a = 0, times what was sent then for a > 0.
+    The reports (ages, nodes, m) are one below the other.
+    """
+    ages, nodes, m, n = past.gain.shape
+    size = nodes * n
+    # What was sent, as linear functions of s: x - e_i at this step, and what s holds of the steps before.
+    sent_now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
+    sent_now = np.pad(sent_now, ((0, 0), (0, length - n - size)))
+    sent_before = np.eye(length - n - size, length, n + size)
+    sent = np.concatenate([sent_now, sent_before]).reshape(ages, nodes, n, length)
+    return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
+
+
+def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> WeightedColumns:
+    """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing."""
+    nodes, _, m = gain.shape
+    if noise.ndim == 3:
+        received = _factor_each(jnp.asarray(noise)[None])
+    else:
+        received = columns_of(noise.reshape(nodes * m, nodes * m))
+    return received.through(_place_on_diagonal(gain[None]))
+
+
+def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
+    """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
+    ages, nodes, m, _ = noise.shape
+    blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
+    return WeightedColumns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
+
+
+def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
+    """Return the block-diagonal matrix of these blocks."""
+    ages, nodes, rows, columns = blocks.shape
+    items = jnp.arange(ages * nodes)
+    empty = jnp.zeros((len(items), rows, len(items), columns))
+    full = empty.at[items, :, items, :].set(blocks.reshape(-1, rows, columns))
+    return full.reshape(len(items) * rows, len(items) * columns)
+
+
+def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
+    """Return B s diag(D) B', which bounds (B mu)(B mu)' for |mu| <= D; s = sum D over what B uses (Cauchy)."""
+    used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
+    return jnp.sum(used) * (into * used) @ into.T
+
+
+def _bound_by_young(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young)."""
+    r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
+    are_positive = (r > 0) & (s > 0)
+    ratio = jnp.where(are_positive, s / jnp.where(r > 0, r, 1.0), 1.0)
+    return jnp.where(are_positive, (1 + ratio) * a + (1 + 1 / ratio) * b, a + b)

@@ -1,0 +1,133 @@
+"""H-infinity design by a Riccati recursion, without a solver, behind a channel whose gains are known."""
+
+import numpy as np
+
+from heliograph.h_infinity.design import HInfinityDesign
+from heliograph.h_infinity.error_system import GrowthSystem
+from heliograph.h_infinity.step_inequality import StepMatrices, list_step_matrices
+from heliograph.numerics.check import TINY, array, fail, instance, scalar
+from heliograph.numerics.types import ArrayLike, Float
+
+SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
+GREATEST = 1e100  # level of a closed form, whose square times squares of matrices doubles hold
+SLACK = 1e-6  # relative strictness that a closed form gives away, so that its certificate has a margin
+
+
+def known_channel_design(
+    system: GrowthSystem, level: float, multipliers: "Float[ArrayLike, 'steps 2'] | None" = None
+) -> HInfinityDesign:
+    """Design gains at a given level for a channel whose gains are certain: a Riccati recursion.
+
+    With Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and the weighted input S = diag(Q, lambda_f~, lambda_h~,
+    level^2)^-1 of (e, f~, h~, v, rho), e+ = E eta - K U eta has K* = E S U' (U S U')^-1 and
+    P2+^-1 = E S E' - K* U S E', the smallest over all gains.
+
+    Args:
+        system: the system, from `growth_system`, whose channel has no random gain.
+        level: gamma, a positive ratio of norms.
+        multipliers: those of f~ and h~ (steps, 2), positive where the function is not zero; zeros by default, which a
+            system that is all linear needs: then this is the H-infinity filter of textbooks.
+
+    Raises:
+        ValueError: a channel with random gains, multipliers of the wrong shape, a level not in (0, 1e100].
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
+    """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
+    level = float(scalar("level", level, TINY, GREATEST))
+    if any(len(link.spreads()) for link in system.channel):
+        raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
+    given = np.zeros((system.steps, 2)) if multipliers is None else array("multipliers", multipliers, (system.steps, 2))
+    for growth, column, name in ((system.growth, 0, "f~"), (system.output_growth, 1, "h~")):
+        if not growth.absent and np.any(given[:, column] <= 0):
+            raise fail(f"multipliers of {name}", "positive ones, since it is not zero", given[:, column].min())
+    return _run_riccati(system, level, given)
+
+
+def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
+    """Return a design by the Riccati recursion at one level; it ends, infeasible, at a step for which no gain exists.
+
+    The weight before step k is P_k = diag(p I, P2), with a number p for x and a matrix P2 for e.
+
+    Args:
+        system: the system.
+        level: gamma.
+        multipliers: of f~ and h~, in the user's units.
+    """
+    n, m, steps = system.states, system.received, system.steps
+    # A little below the level, so that the certificate has a margin.
+    inner_level = level * (1 - SLACK)
+    # P_0: P2 as large as level^2 W allows, and p so small that the weight of x costs next to nothing of the level,
+    # whatever B v adds to x.
+    error_weight = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
+    input_size = float(np.max(np.linalg.norm(system.disturbance, 2, axis=(1, 2))))
+    state_weight = SLACK * min(error_weight, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
+    design = HInfinityDesign(
+        level=level,
+        gains=np.full((steps, n, m), np.nan),
+        weights=np.full((steps + 1, 2 * n, 2 * n), np.nan),
+        multipliers=np.full((steps, 4), np.nan),
+        feasible=False,
+        status="",
+    )
+    design.weights[0] = np.diag(np.repeat([state_weight, error_weight], n))
+    # Step by step: K and P2 in closed form, p small enough that it does no harm.
+    for k, step in enumerate(list_step_matrices(system, separate=True)):
+        found = _compute_best_gain(system, step, design.weights[k, n:, n:], inner_level, multipliers[k])
+        if found is None:
+            text = f"no gain exists at step {k} of {steps} with these multipliers"
+            return design._replace(status=text, failed_step=k)
+        design.gains[k], next_error_weight = found
+        state_weight, (multiplier_f, multiplier_h) = _compute_state_weight(system, k, state_weight)
+        no_coupling = np.zeros((n, n))
+        design.weights[k + 1] = np.block([[state_weight * np.eye(n), no_coupling], [no_coupling, next_error_weight]])
+        design.multipliers[k] = [multiplier_f, multipliers[k, 0], multiplier_h, multipliers[k, 1]]
+    return design._replace(feasible=True, status="optimal")
+
+
+def _compute_best_gain(
+    system: GrowthSystem,
+    step: StepMatrices,
+    weight: Float[np.ndarray, "n n"],
+    level: float,
+    multipliers: Float[np.ndarray, "2"],
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
+    """Return the best gain K* of a step and the largest weight P2+ of e after it, or None where there is no gain.
+
+    Over the part (e, f~, h~, v, rho) of eta: e+ = E eta before the correction, U eta is received less its prediction,
+    and S^-1 is the quadratic form of what a level allows. K* = E S U' (U S U')^-1 and P2+ = (E S E' - K* U S E')^-1.
+
+    Args:
+        system: the system.
+        step: its matrices at this step, of which E is `error` and U `received`.
+        weight: P2 before the step.
+        level: gamma.
+        multipliers: lambda of f~ and h~.
+    """
+    errors = slice(system.states, 2 * system.states)
+    grows = [not growth.absent for growth in (system.growth, system.output_growth)]
+    # S^-1: P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I of e, the multipliers of f~ and h~, level^2 of v and rho. The
+    # growth forms of differences, f~ and h~, are every second one.
+    inverse_s = level**2 * step.energy - step.target - np.diag(multipliers[grows] @ step.growth[1::2])
+    inverse_s[errors, errors] += weight
+    if np.linalg.eigvalsh(inverse_s[errors, errors])[0] <= 0:
+        return None
+    used = np.flatnonzero(np.diag(inverse_s))
+    S, E, U = np.linalg.inv(inverse_s[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
+    cross, spread = U @ S @ E.T, U @ S @ U.T
+    solution, *_ = np.linalg.lstsq(spread, cross, rcond=None)
+    gain = solution.T
+    next_weight = np.linalg.inv(E @ S @ E.T - gain @ cross)
+    return gain, (1 - SLACK) * (next_weight + next_weight.T) / 2
+
+
+def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
+    """Return the next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
+
+    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do, and
+    d = SPARE leaves a part of it for the multipliers.
+    """
+    size, a, b = np.linalg.norm(system.transition[k], 2), system.growth.state[k], system.output_growth.state[k]
+    next_state = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))
+    multiplier_f = next_state * (1 + SPARE) ** 2 * float(1 + size / a) if a > 0 else next_state * 10 / SPARE
+    multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))
+    return next_state, (multiplier_f, multiplier_h)

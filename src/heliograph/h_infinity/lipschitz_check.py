@@ -1,0 +1,398 @@
+"""Check a function's growth (Lipschitz) constant over a box: largest slope, a pair that breaks it, a proof."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from typing_extensions import TypeAliasType
+
+from heliograph.h_infinity.interval_arithmetic import Interval, NoIntervalError, bound_program
+from heliograph.numerics.check import array, check_seed, error_text, fail, flag, scalar
+from heliograph.numerics.check import function as check_callable
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+
+POINTS = 2**12  # of a low-discrepancy sequence, at which slopes are taken
+CLIMBERS, TRIALS, ROUNDS = 16, 32, 60  # steepest points kept, random moves from each, and times this is repeated
+SHRINK = 0.8  # of the moves' size from round to round: from half the region to 1e-6 of it
+NEARBY = 1e-4  # distance of a close pair, relative to the region's width; closer ones lose digits
+TOLERANCE = 1e-9  # relative excess over the constant that counts as rounding
+
+Pair = TypeAliasType("Pair", tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]])  # two points
+Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with jax.numpy
+
+
+@readable
+class GrowthFinding(NamedTuple):
+    """Evidence for or against |f(x) - f(y)| <= constant |x - y| and f(0) = 0 in a box.
+
+    `refuted` if any evidence breaks the constant, `proved` if the bound is within it; otherwise it is assumed.
+
+    Args:
+        name: the function's name in sentences.
+        constant: the growth constant a.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        slope: largest norm of a Jacobian met in the box: at least this large is every true constant; infinite where f
+            is no number.
+        point: where that slope is (n,).
+        pair: the points x, y with the largest ratio met, each (n,).
+        ratio: |f(x) - f(y)| / |x - y| of that pair.
+        at_zero: |f(0)|.
+        bound: a bound of every slope in the box by interval arithmetic on f's operations; None where these cannot be
+            followed.
+        reason: why there is no bound; empty if there is one.
+        differences: false for evidence about |f(x)| <= constant |x| alone.
+    """
+
+    name: str
+    constant: float
+    low: Float[np.ndarray, "n"]
+    high: Float[np.ndarray, "n"]
+    slope: float
+    point: Float[np.ndarray, "n"]
+    pair: Pair
+    ratio: float
+    at_zero: float
+    bound: float | None
+    reason: str
+    differences: bool
+
+    @property
+    def limit(self) -> float:
+        """Constant plus what counts as rounding."""
+        return self.constant * (1 + TOLERANCE)
+
+    @property
+    def starts_at_zero(self) -> bool:
+        """True if f(0) = 0, to rounding of what the constant allows over the box."""
+        return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
+
+    @property
+    def around_zero(self) -> bool:
+        """True if 0 is in the box: slopes then bound f itself too."""
+        return bool(np.all(self.low <= 0) and np.all(self.high >= 0))
+
+    @property
+    def refuted(self) -> bool:
+        """True if a pair, a slope or f(0) breaks the constant."""
+        steep = self.differences and not self.slope <= self.limit
+        return steep or not self.ratio <= self.limit or not self.starts_at_zero
+
+    @property
+    def proved(self) -> bool:
+        """True if no slope in the box exceeds the constant, for certain."""
+        return not self.refuted and self.bound is not None and self.bound <= self.limit
+
+    @property
+    def text(self) -> str:
+        """Verdict and evidence in one line."""
+        where = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
+        if self.proved:
+            return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
+        if not self.refuted:
+            proved = "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
+            why = self.reason or proved
+            verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
+            return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {why}"
+        return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
+
+    def _describe_evidence(self) -> str:
+        """Return in words what refutes the constant: f(0), the slope at a point, or the ratio of a pair."""
+        if not self.starts_at_zero:
+            return f"f(0) has the norm {self.at_zero:.6g}, not 0"
+        if self.ratio <= self.limit:
+            return f"slope {self.slope:.6g} at {np.round(self.point, 6).tolist()}"
+        x, y = (np.round(p, 6).tolist() for p in self.pair)
+        return f"ratio {self.ratio:.6g} at {x} and {y}"
+
+
+def check_growth(
+    function: Function,
+    constant: float,
+    low: "Float[ArrayLike, ' n']",
+    high: "Float[ArrayLike, ' n']",
+    name: str = "f",
+    seed: int = 0,
+    differences: bool = True,
+) -> GrowthFinding:
+    """Search a box for a function's largest slope, for a pair that refutes a growth constant, and for a proof of it.
+
+    Slopes are norms of Jacobians, by automatic differentiation, at 4,096 points of a Sobol sequence; from the steepest
+    ones the search goes on by random moves of shrinking size. Pairs start close together along the steepest directions,
+    and far apart, and move likewise. A box is convex, so in it the largest slope is the smallest true constant. Where f
+    is written in operations that interval arithmetic can follow, the constant is then proved by bounds of the Jacobian
+    over parts of the box. An f(0) that is not 0 refutes any constant, so that a proof over a box with 0 in it holds for
+    |f(x)| <= a |x| too.
+
+    Args:
+        function: f, from (n,) to (m,) or a number, written with jax.numpy.
+        constant: the growth constant a, not negative.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        name: the function's name in sentences; "f" by default.
+        seed: seed of the search; 0 by default.
+        differences: False for the weaker condition on f itself, |f(x)| <= a |x|: pairs with 0, which has to be in the
+            box (default True).
+
+    Raises:
+        ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
+    Source: H-infinity fusion over amplify-and-forward relays, condition (2).
+    """
+    constant = float(scalar("growth constant", constant, 0.0))
+    bottom, top = _check_box(low, high)
+    differences = flag("differences", differences)
+    seed = check_seed("seed", seed)
+    _check_function(check_callable("function", function, "the state"), bottom)
+    if not differences and (np.any(bottom > 0) or np.any(top < 0)):
+        raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
+    meter, random = _LipschitzMeter(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    starts = bottom + (top - bottom) * scipy.stats.qmc.Sobol(len(bottom), seed=seed).random(POINTS)
+    if differences:
+        points, pairs = _search_slopes_and_pairs(meter, starts, bottom, top, random)
+    else:  # |f(x)| <= a |x| alone: pairs of a point and 0
+        points = _climb_at_random(lambda x: meter.measure_ratios(_pair_with_zero(x)), starts, bottom, top, random)
+        pairs = _pair_with_zero(points)
+    return _make_finding(name, constant, bottom, top, meter, points, pairs, differences)
+
+
+def _check_function(function: Function, point: Float[np.ndarray, "n"]) -> None:
+    """Raise ValueError unless the function returns a number or a vector at a point."""
+    expected = "one of the state in operations of jax.numpy that returns a number or a vector"
+    try:
+        with jax.enable_x64(True):
+            axes = len(jax.eval_shape(lambda x: jnp.atleast_1d(function(x)), point).shape)
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("function", expected, error_text(error)) from error
+    if axes != 1:
+        raise fail("function", expected, f"{axes} axes")
+
+
+def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return the corners of a box as arrays; raise ValueError unless low <= high, and low < high somewhere."""
+    bottom = np.asarray(array("low corner of the region", low, (None,)))
+    top = np.asarray(array("high corner of the region", high, bottom.shape))
+    if np.any(top < bottom) or not np.any(top > bottom):
+        raise fail("region", "a low corner below the high one", f"{bottom.tolist()} and {top.tolist()}")
+    return bottom, top
+
+
+class _LipschitzMeter:
+    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
+
+    def __init__(self, function: Function, width: float):
+        self.width, self.function = width, function
+        self.jacobian = _compile_by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
+        self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
+
+    def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
+        """Return the norm of the Jacobian at each point; infinite where it is no number."""
+        values = np.asarray(self.jacobian(points))
+        finite = np.isfinite(values).all(axis=(-2, -1))
+        safe = np.where(finite[:, None, None], values, 0.0)
+        return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
+
+    def find_steepest_directions(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
+        """Return the unit direction in which the function changes most at each point."""
+        return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
+
+    def measure_ratios(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
+        """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
+        x, y = np.split(pairs, 2, axis=1)
+        distance = np.linalg.norm(x - y, axis=1)
+        apart = distance > NEARBY * self.width / 2
+        change = np.linalg.norm(np.asarray(self.values(x)) - self.values(y), axis=1)
+        return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
+
+    def measure_at_zero(self, n: int) -> float:
+        """Return the size |f(0)|, infinite where it is no number."""
+        size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
+        return size if np.isfinite(size) else np.inf
+
+
+def _pair_with_zero(points: Float[np.ndarray, "points n"]) -> Float[np.ndarray, "points n+n"]:
+    """Return each point with 0 behind it, as a pair."""
+    return np.concatenate([points, np.zeros_like(points)], axis=1)
+
+
+def _search_slopes_and_pairs(
+    meter: _LipschitzMeter,
+    starts: Float[np.ndarray, "starts n"],
+    low: Float[np.ndarray, "n"],
+    high: Float[np.ndarray, "n"],
+    random: np.random.Generator,
+) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
+    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
+    # Largest slope: the starts, then random moves from the steepest.
+    points = _climb_at_random(meter.measure_slopes, starts, low, high, random)
+    # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
+    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2
+    close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
+    far = low + (high - low) * random.random((POINTS, 2, len(low)))
+    pairs = np.concatenate([close, far.reshape(POINTS, -1)])
+    return points, _climb_at_random(meter.measure_ratios, pairs, np.tile(low, 2), np.tile(high, 2), random)
+
+
+def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of points, compiled for as many at a time as a climb tries, so that it is one program."""
+    compute = compile_in_float64(function)
+
+    def call(points: np.ndarray) -> np.ndarray:
+        """Compute part by part, the last one padded by repetition of the last point."""
+        size = CLIMBERS * TRIALS
+        padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
+        values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]
+        return np.concatenate(values)[: len(points)]
+
+    return call
+
+
+def _make_finding(
+    name: str,
+    constant: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    meter: _LipschitzMeter,
+    points: np.ndarray,
+    pairs: np.ndarray,
+    differences: bool,
+) -> GrowthFinding:
+    """Return the finding from the points and pairs that a search ended at, with a bound unless it is refuted.
+
+    Args:
+        name: of the function.
+        constant: a, the growth constant in question.
+        low: lower corner of the box (n,).
+        high: upper corner of the box (n,).
+        meter: slopes and ratios of the function.
+        points: (points, n), of which the steepest is reported.
+        pairs: (pairs, 2n), x and y of each, of which that of the largest ratio is reported.
+        differences: whether the constant bounds |f(x) - f(y)| / |x - y|; else |f(x)| / |x|.
+    """
+    slopes, ratios = meter.measure_slopes(points), meter.measure_ratios(pairs)
+    steepest, largest_ratio = int(np.argmax(slopes)), int(np.argmax(ratios))
+    x, y = np.split(pairs[largest_ratio], 2)
+    finding = GrowthFinding(
+        name=name,
+        constant=float(constant),
+        low=low,
+        high=high,
+        slope=float(slopes[steepest]),
+        point=points[steepest],
+        pair=(x, y),
+        ratio=float(ratios[largest_ratio]),
+        at_zero=meter.measure_at_zero(len(low)),
+        bound=None,
+        reason="",
+        differences=differences,
+    )
+    if finding.refuted:
+        return finding
+    bound = prove_slope_bound(meter.function, low, high, finding.limit)
+    return finding._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
+
+
+def _climb_at_random(
+    objective: Callable[[np.ndarray], np.ndarray],
+    starts: Float[np.ndarray, "starts n"],
+    low: Float[np.ndarray, "n"],
+    high: Float[np.ndarray, "n"],
+    random: np.random.Generator,
+) -> Float[np.ndarray, "climbers n"]:
+    """Return the CLIMBERS best starts, each moved to the best of random moves around it ROUNDS times, in the box."""
+    climbers = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
+    deviation = (high - low) / 2
+    for _ in range(ROUNDS):
+        # TRIALS normal moves of each, the first of which stays, then smaller ones.
+        trials = climbers[:, None] + deviation * random.normal(size=(len(climbers), TRIALS, len(low)))
+        trials[:, 0] = climbers
+        trials = np.clip(trials, low, high)
+        values = objective(trials.reshape(-1, len(low))).reshape(len(climbers), TRIALS)
+        climbers = trials[np.arange(len(climbers)), values.argmax(axis=1)]
+        deviation = SHRINK * deviation
+    return climbers
+
+
+BOXES = 256  # looked at together
+LIMIT = 16_384  # boxes in all: what is not proven by then is left unproven
+NORM_ROUNDING = 1e-13  # relative, of the spectral norm of a small matrix
+
+
+class SlopeBound(NamedTuple):
+    """Largest norm that a Jacobian in the box can have, infinite if nothing is proven, and the reason if so."""
+
+    value: float
+    reason: str
+
+
+def prove_slope_bound(
+    function: Callable[[jax.Array], jax.Array], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
+) -> SlopeBound:
+    """Return a proven bound of |f(x) - f(y)| / |x - y| over a box, below `goal` if LIMIT boxes suffice.
+
+    |J| <= |C| + |R| (spectral norms) for every J in the interval C +- R of a part's Jacobians; a function that is
+    continuous, and differentiable but for kinks, has no larger ratio than the largest of these. Continuous is one made
+    of continuous operations, with every decision the same throughout the box.
+    """
+    try:
+        with jax.enable_x64(True):
+            example = jnp.zeros((BOXES, len(low)))
+            # The function itself over the whole box: refused unless it is continuous.
+            values = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
+            whole_box = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
+            bound_program(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
+            slopes = jax.make_jaxpr(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(example)
+            return SlopeBound(_sharpen_bound(slopes, low, high, goal), "")
+    except NoIntervalError as reason:
+        return SlopeBound(np.inf, f"cannot follow {reason}")
+
+
+def _sharpen_bound(
+    slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
+) -> float:
+    """Return the largest bound of a slope, after halving boxes whose bound is above the goal, LIMIT boxes at most."""
+    bottoms, tops = low[None], high[None]
+    largest_within = 0.0  # bound of the boxes that are within the goal
+    boxes_seen = 0
+    while len(bottoms):
+        bounds = np.concatenate(
+            [_bound_slopes(slopes, bottoms[i : i + BOXES], tops[i : i + BOXES]) for i in range(0, len(bottoms), BOXES)]
+        )
+        boxes_seen += len(bottoms)
+        undecided = bounds > goal
+        largest_within = max(largest_within, float(np.max(bounds[~undecided], initial=0.0)))
+        if boxes_seen + 2 * np.count_nonzero(undecided) > LIMIT:
+            return max(largest_within, float(np.max(bounds)))
+        bottoms, tops = _halve_boxes(bottoms[undecided], tops[undecided], high - low)
+    return largest_within
+
+
+def _bound_slopes(
+    slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray
+) -> Float[np.ndarray, " boxes"]:
+    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing."""
+    # The program is for BOXES boxes: fewer are padded.
+    padding = BOXES - len(low)
+    ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
+    (jacobian,) = bound_program(slopes, [Interval(*ends)], continuous=False)
+    # |J| <= |C| + |R| for J in C +- R.
+    finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
+    least, largest = np.where(finite, jacobian.low, 0.0), np.where(finite, jacobian.high, 0.0)
+    centre = least / 2 + largest / 2
+    radius = np.nextafter(np.maximum(largest - centre, centre - least), np.inf)
+    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius)) * (1 + NORM_ROUNDING)
+    return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
+
+
+def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return every box in two, halved across its widest side relative to `width`, the sides of the whole region."""
+    sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
+    rows = np.arange(len(low))
+    middle = (low[rows, sides] + high[rows, sides]) / 2
+    left, right = high.copy(), low.copy()
+    left[rows, sides] = right[rows, sides] = middle
+    return np.concatenate([low, right]), np.concatenate([left, high])

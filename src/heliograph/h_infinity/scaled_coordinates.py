@@ -1,0 +1,233 @@
+"""Scaled coordinates in which the matrix inequalities of H-infinity designs are of order one, and the way back."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliograph.h_infinity.error_system import GrowthSystem
+from heliograph.h_infinity.step_inequality import StepMatrices, Unknowns
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
+
+CONVERGED = 0.1  # more of each error's variance: what the gain of the step before may cost to be searched near again
+RANK = 1e-12  # share of the largest correlation of received numbers below which a combination is taken for none
+SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
+
+
+class ScaledCoordinates(NamedTuple):
+    """Scaled coordinates in which a design is computed, and the way back to the user's units.
+
+    states: (x, e) = diag(S1, S2) times scaled ones, before every step and after the last. received: scales of what is
+    received; forms: of the growth forms; unit: of the level. nothing_grows: whether f and h are zero.
+    """
+
+    states: Float[np.ndarray, "times w w"]
+    received: Float[np.ndarray, "steps m"]
+    forms: Float[np.ndarray, "steps multipliers"]
+    unit: float
+    nothing_grows: bool
+
+    def relative_scales(self, k: int) -> tuple[float, float]:
+        """Return the scales of x and e before step k, over the larger of both.
+
+        (1, 1) where nothing grows: S1 and S2 are matrices then, else multiples of the identity, since growth compares
+        norms of x and e.
+        """
+        if self.nothing_grows:
+            return 1.0, 1.0
+        x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
+        return x / max(x, e), e / max(x, e)
+
+    def unscale_weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
+        """Return the weight P_k in the user's units."""
+        half = np.linalg.solve(self.states[k].T, scaled)
+        return self.unit**2 * _symmetrise(np.linalg.solve(self.states[k].T, half.T))
+
+    def scale_initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+        """Return the weight P_0 in scaled coordinates."""
+        return _symmetrise(self.states[0].T @ weight @ self.states[0]) / self.unit**2
+
+    def unscale_gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
+        """Return the gain of step k in the user's units."""
+        n = len(scaled)
+        return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
+
+    def unscale_multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
+        """Return the multipliers of step k in the user's units."""
+        return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
+
+
+def _symmetrise(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+    """Return (A + A') / 2."""
+    return np.asarray((a + a.T) / 2)
+
+
+def scale_steps(
+    system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
+) -> tuple[list[StepMatrices], ScaledCoordinates]:
+    """Return the steps in coordinates in which all numbers are of order one, and the way back to the user's units.
+
+    Scales are the deviations of x, e and what is received, if disturbances were independent noises of unit variance and
+    the filter had these `gains`; None stands for gains near the best predictor's. These are the nominal gains of the
+    scaled steps, whose unknown is a correction of them.
+    """
+    n, nothing_grows = system.states, system.growth.absent and system.output_growth.absent
+    # Covariances of x_0 and e_0 from the initial weight.
+    initial = np.diag(1 / np.diagonal(system.initial_weight))
+    x, e = initial[:n, :n], initial[n:, n:]
+    state_scales, received_scales, form_scales = [_choose_state_scales(x, e, nothing_grows)], [], []
+    scaled, largest_target, nominal = list[StepMatrices](), 0.0, steps[0].nominal
+    for k, step in enumerate(steps):
+        # Covariances of (x, e) after the step with the nominal gain, and scales from these.
+        eta = _compute_eta_covariance(system, k, step, x, e)
+        largest_target = max(largest_target, float(np.trace(step.target @ eta)))
+        x, e, received, gain = _propagate_covariances(step, eta, None if gains is None else gains[k])
+        is_taken_as_it_is = gains is not None or k == 0  # else the gain of the step before may serve
+        nominal = gain if is_taken_as_it_is else _keep_gain(nominal, gain, received, e)
+        state_scales.append(_choose_state_scales(x, e, nothing_grows))
+        received_scales.append(_powers_of_four_near(np.sqrt(np.diagonal(received))))
+        eta_scales = _choose_eta_scales(system, k, step, state_scales[k])
+        # Scales that make the largest entry of each growth form 1. Forms are diagonal, and so, with growth, are the
+        # scales of eta.
+        size = np.max(np.abs(step.growth) * np.diagonal(eta_scales) ** 2, axis=1, initial=0.0)
+        form_scales.append(np.where(size > 0, size, 1.0))
+        scaled.append(_rescale_step(step, eta_scales, state_scales[k + 1], received_scales[k], form_scales[k], nominal))
+    if largest_target == 0:
+        raise fail("wanted matrix", "one that is not zero", "zero at every step")
+    # Levels in units of the largest root of E |M e|^2.
+    unit = float(_nearest_power_of_four(np.sqrt(largest_target)))
+    coordinates = ScaledCoordinates(
+        states=np.array(state_scales),
+        received=np.array(received_scales),
+        forms=np.array(form_scales),
+        unit=unit,
+        nothing_grows=nothing_grows,
+    )
+    return [s._replace(target=s.target / unit**2) for s in scaled], coordinates
+
+
+def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    """Return the power of 4 nearest to a size, by which numbers are scaled without rounding."""
+    return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
+
+
+def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> Float[np.ndarray, "w w"]:
+    """Return scales diag(S1, S2) of x and e from their covariances.
+
+    Factors of the covariances where nothing grows; else a number for each, since growth is a ratio of norms.
+    """
+    if nothing_grows:
+        return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
+    deviations = [np.full(len(p), np.sqrt(np.trace(p) / len(p))) for p in (x, e)]
+    return np.diag(np.concatenate([_powers_of_four_near(sizes) for sizes in deviations]))
+
+
+def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the lower factor of a covariance with a little variance added, for a state that is never disturbed."""
+    unit = _powers_of_four_near(np.sqrt(np.diagonal(covariance)))
+    return np.asarray(
+        unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
+    )
+
+
+def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the powers of 4 near the sizes; a component of size zero takes the smallest of the others."""
+    positive = size[size > 0]
+    return _nearest_power_of_four(np.where(size > 0, size, positive.min() if positive.size else 1.0))
+
+
+def _compute_eta_covariance(
+    system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray
+) -> np.ndarray:
+    """Return the covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows.
+
+    x and e are the covariances of x and e before step k; disturbances v and rho have the variance 1, and functions that
+    are absent no part in eta.
+    """
+    n, y, q = system.states, system.output.shape[1], len(step.energy)
+    covariance, begin = np.zeros((q, q)), 2 * n
+    covariance[:n, :n], covariance[n:begin, n:begin] = x, e
+    for growth, width in ((system.growth, n), (system.output_growth, y)):
+        if growth.absent:
+            continue
+        # |f(x)|^2 <= a^2 |x|^2, at most a^2 times the largest variance in any direction.
+        for constant, p in ((growth.state[k], x), (growth.error[k], e)):
+            part = slice(begin, begin + width)
+            covariance[part, part] = constant**2 * np.linalg.eigvalsh(p)[-1] * np.eye(width)
+            begin += width
+    covariance[begin:, begin:] = np.eye(q - begin)
+    return covariance
+
+
+def _propagate_covariances(
+    step: StepMatrices, eta: np.ndarray, given: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the covariances of x+, of e+ with the given or the best gain and of what is received, and that gain.
+
+    eta: the covariance of eta before the step.
+    """
+    by_mean = step.received @ eta @ step.received.T
+    received = by_mean + np.einsum("jai,ik,jbk->ab", step.spreads, eta, step.spreads)
+    # The best gain Cov(e+, received) Cov(received)^-1, in units of what is received.
+    cross = step.error @ eta @ step.received.T
+    unit = np.sqrt(np.maximum(np.diagonal(received), np.finfo(float).tiny))
+    best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=RANK, hermitian=True) / unit
+    gain = best if given is None else given
+    # e+ after the correction, and at least SMALLEST of what it was before.
+    before, left = step.error @ eta @ step.error.T, step.error - gain @ step.received
+    after = left @ eta @ left.T + gain @ (received - by_mean) @ gain.T
+    floor = SMALLEST**2 * np.diag(np.diagonal(before))
+    return step.state @ eta @ step.state.T, _symmetrise(after) + floor, received, gain
+
+
+def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the last step's gain K0 where it loses little against the best K, else K.
+
+    It adds (K - K0) R (K - K0)' to the covariance `after` the correction, R the received covariance.
+    """
+    more = (last - best) @ received @ (last - best).T
+    return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
+
+
+def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
+    """Return the scales T of eta = T times what is of order one, from those of (x, e) before the step."""
+    n, y = system.states, system.output.shape[1]
+    parts = [sizes]
+    for growth, width in ((system.growth, n), (system.output_growth, y)):
+        if not growth.absent:
+            for constant, size in ((growth.state[k], sizes[0, 0]), (growth.error[k], sizes[n, n])):
+                parts.append((constant * size if constant > 0 else size) * np.eye(width))
+    return np.asarray(block_diag(*parts, np.eye(len(step.energy) - sum(map(len, parts)))))
+
+
+def _rescale_step(
+    step: StepMatrices,
+    eta_scales: np.ndarray,
+    state_scales: np.ndarray,
+    received_scales: np.ndarray,
+    form_scales: np.ndarray,
+    nominal: np.ndarray,
+) -> StepMatrices:
+    """Return the step in scaled coordinates, with errors about the nominal gain.
+
+    Args:
+        step: in the user's units.
+        eta_scales: T of eta = T times scaled eta.
+        state_scales: diag(S1, S2), that of (x, e) after the step.
+        received_scales: one number for each that is received.
+        form_scales: one number for each growth form.
+        nominal: the gain about which errors are.
+    """
+    n = step.state.shape[0]
+    s1, s2, per_received = state_scales[:n, :n], state_scales[n:, n:], received_scales[:, None]
+    return StepMatrices(
+        state=np.linalg.solve(s1, step.state @ eta_scales),
+        error=np.linalg.solve(s2, (step.error - nominal @ step.received) @ eta_scales),
+        received=step.received @ eta_scales / per_received,
+        spreads=step.spreads @ eta_scales / per_received,
+        target=_symmetrise(eta_scales.T @ step.target @ eta_scales),
+        energy=_symmetrise(eta_scales.T @ step.energy @ eta_scales),
+        growth=step.growth * np.diagonal(eta_scales) ** 2 / form_scales[:, None],
+        nominal=np.linalg.solve(s2, nominal * received_scales),
+    )
