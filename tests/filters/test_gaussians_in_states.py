@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters import gaussians_in_states
 
 DEVIATION = 2.0

@@ -15,7 +15,14 @@ from heliograph.factors.covariance_factors import (
     rounding_of,
     square_root,
 )
-from heliograph.factors.gaussian import Gaussian, correct_by_gain, from_columns, gain_of, predict_affine, take_leading
+from heliograph.factors.factored_gaussian import (
+    Gaussian,
+    correct_by_gain,
+    from_columns,
+    gain_of,
+    predict_affine,
+    take_leading,
+)
 from heliograph.filters.gaussian.signal_moments import augmented_second_moment
 from heliograph.fusion.cross_covariance import ErrorMap, ErrorMoments
 from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.event.gaussian_in_ball import ball_moments, truncate_to_ball
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.numerics import compile_in_float64

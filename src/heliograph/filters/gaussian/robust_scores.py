@@ -17,7 +17,7 @@ from heliograph.factors.factored_gaussian import (
     impose_moments_of_combination,
     take_leading,
 )
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.received_outlier_noise import NoiseBranches
 from heliograph.numerics.module import Module, readable, unwritten
 

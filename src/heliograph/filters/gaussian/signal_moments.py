@@ -17,8 +17,8 @@ from heliograph.factors.covariance_factors import (
     square_root,
     unit_of,
 )
-from heliograph.factors.gaussian import Gaussian, Innovations, condition_on_observation
-from heliograph.factors.repeated import triangularise_noise
+from heliograph.factors.factored_gaussian import Gaussian, Innovations, condition_on_observation
+from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, linear_image
 from heliograph.model.estimate import Innovation
 from heliograph.model.plant import AbstractPlant

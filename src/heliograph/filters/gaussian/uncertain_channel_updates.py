@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance
 from heliograph.filters.gaussian.signal_moments import ArrivedInnovation, Signal, condition_on_received
 from heliograph.filters.gaussian.uncertain_channel_bounds import (
     Scalars,

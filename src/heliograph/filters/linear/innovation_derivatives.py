@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.filters.gaussians_in_states import MomentSlopes
 from heliograph.model.over_time import at
 from heliograph.numerics.linalg import psd_solve, symmetric

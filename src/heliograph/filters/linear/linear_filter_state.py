@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.gaussian import Gaussian, from_covariance, predict_affine
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.linalg import symmetric

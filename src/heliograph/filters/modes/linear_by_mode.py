@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.columns import WeightedColumns, rounding_of
+from heliograph.factors.covariance_factors import WeightedColumns, rounding_of
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor

@@ -8,7 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.factors.gaussian import Gaussian, from_covariance_by_elimination, merge_mixture, moments_of_mixture
+from heliograph.factors.factored_gaussian import (
+    Gaussian,
+    from_covariance_by_elimination,
+    merge_mixture,
+    moments_of_mixture,
+)
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, predict_gaussian
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.model.plant import AbstractPlant, LinearPlant

@@ -168,7 +168,7 @@ def _compile_in_place(
     `differs` says which arguments have an entry for each run. None without native code.
     """
     code = _compile_call(function, filter, arguments, differs)
-    return None if code is None else code.for_runs(runs, dict(enumerate(jax.tree.leaves(arguments))))
+    return None if code is None else code.make_in_place_code(runs, dict(enumerate(jax.tree.leaves(arguments))))
 
 
 def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:

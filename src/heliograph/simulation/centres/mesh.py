@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.engine.limits import MESH
+from heliograph.engine.size_thresholds import MESH
 from heliograph.fusion.covariance_intersection import invert_positive_definite
 from heliograph.fusion.cross_covariance import Motion, propagate_state
 from heliograph.fusion.mesh.joint_error_covariance import blocks_of

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from heliograph.filters.wrappers.told_link_law import ToldFilter
-from heliograph.numerics.counted_shares import average_correlated
+from heliograph.numerics.confidence_intervals import average_correlated
 from heliograph.numerics.types import Float, Int
 from heliograph.simulation.declared.refit import DeclaredRows
 from heliograph.simulation.results.whiteness import whitened_innovations
