@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.export.layout import Layout, lay_out_array, lay_out_struct
 from heliograph.export.program import Real, StepProgram
 from heliograph.filters.base import AbstractFilter
-from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
+from heliograph.model.checks.split_intervals import explain_unevenness, find_part_by_steps
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_count, fail

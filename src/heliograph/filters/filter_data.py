@@ -12,7 +12,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
-from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.checks.row_times import check_dates, find_common_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.forecast_origin import KeptOrigin, Origin, find_usual_months, find_usual_spacing, last_input

@@ -16,9 +16,9 @@ from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
 from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, lay_side_by_side
-from heliograph.model.checks.refusals import count_by_reason
-from heliograph.model.limits import Limits
+from heliograph.model.checks.refusal_reasons import count_by_reason
 from heliograph.model.over_time import steps_covered
+from heliograph.model.reading_limits import Limits
 from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import name_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar

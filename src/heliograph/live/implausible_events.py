@@ -12,7 +12,7 @@ from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.sorted_rows import BEFORE, HeldRow
-from heliograph.model.checks.faults import find_function_fault
+from heliograph.model.checks.non_finite_results import find_function_fault
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Float
 from heliograph.simulation.description.wide_angles import WideAngles

@@ -3,7 +3,7 @@
 from functools import cached_property
 
 from heliograph.live.stored.snapshot import Identity, network_identity
-from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
+from heliograph.model.checks.split_intervals import explain_unevenness, find_part_by_steps
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.caching import share_by_object

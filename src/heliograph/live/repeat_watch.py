@@ -6,7 +6,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import unstack
 from heliograph.model.repeated_readings import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
 from heliograph.model.sensor import AbstractSensor, AnySensor

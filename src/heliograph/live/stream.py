@@ -14,12 +14,12 @@ from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
 from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
-from heliograph.model.checks.faults import find_function_fault
-from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
+from heliograph.model.checks.non_finite_results import find_function_fault
+from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.model.checks.refusal_reasons import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
-from heliograph.model.limits import LimitsLike, ScreenedReadings, make_limits
+from heliograph.model.reading_limits import LimitsLike, ScreenedReadings, make_limits
 from heliograph.model.repeated_readings import Repeats, StuckLike
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable

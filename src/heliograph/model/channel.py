@@ -7,10 +7,10 @@ from typing import Literal, overload
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.channel_side_information import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.reported_numbers import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.model.turn_invariance import check_turns
 from heliograph.numerics.angle import Angles

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.intervals import StateLimits, StateLimitsLike, read_state_limits
+from heliograph.model.diffuse_start import DiffuseStart
+from heliograph.model.limit_arguments import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.turn_invariance import check_turns
-from heliograph.model.unknown_start import DiffuseStart
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.check import array, covariance, error_text, fail, function, instance, items, name_list, names
 from heliograph.numerics.linalg import cholesky

@@ -10,9 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.input_dependent_sensor import (
+    GivenInputs,
+    NoiseOfInputs,
+    count_rows,
+    name_inputs,
+    read_noise_of_inputs,
+)
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
-from heliograph.model.sensor_inputs import GivenInputs, NoiseOfInputs, count_rows, name_inputs, read_noise_of_inputs
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.intervals import StateLimitsLike
+from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import TIME_STEP, LinearPlant
 from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
 from heliograph.numerics.module import Module, readable

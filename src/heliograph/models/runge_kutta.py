@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.intervals import StateLimitsLike
+from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import Plant, check_shape
 from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, with_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance

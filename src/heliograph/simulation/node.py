@@ -9,13 +9,13 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel, check_sent
+from heliograph.model.channel_side_information import name_received
 from heliograph.model.estimate import Claim
-from heliograph.model.limits import Limits, LimitsLike, make_limits
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.reading_limits import Limits, LimitsLike, make_limits
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.repeated_readings import StuckLike
-from heliograph.model.reported_numbers import name_received
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.words.encoder import Words

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import INPUT, Judgement
-from heliograph.model.checks.faults import find_function_fault
+from heliograph.model.checks.non_finite_results import find_function_fault
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree

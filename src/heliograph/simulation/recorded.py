@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.checks.refusals import number_of
+from heliograph.model.checks.refusal_reasons import number_of
 from heliograph.model.checks.row_times import find_common_dates, warn_of_unequal_steps
 from heliograph.model.forecast_origin import Origin, find_usual_months, find_usual_spacing, last_input
 from heliograph.model.plant import TIME_STEP

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.checks.refusals import Reason, count_by_reason, number_of
-from heliograph.model.limits import Limits
+from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of
+from heliograph.model.reading_limits import Limits
 from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.types import Float, Int

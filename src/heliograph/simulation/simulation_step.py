@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Estimate
-from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.check import fail

@@ -29,12 +29,12 @@ from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, l
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
-from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.premises.premise import believes
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64

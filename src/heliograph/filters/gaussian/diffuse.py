@@ -20,12 +20,12 @@ from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimat
 from heliograph.filters.gaussian.belief import process_noise, second_moments_at_start
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.channel import perfect
+from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import Premise, on_premise
 from heliograph.model.sensor import AnySensor, check_linear, check_sensor
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike
 

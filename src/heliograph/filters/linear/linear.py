@@ -29,7 +29,7 @@ from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, on_premise

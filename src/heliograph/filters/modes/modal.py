@@ -45,7 +45,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_s
 from heliograph.linear.jump_system import mix_modes, propagate_by_mode
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import OverTime, at, first, restack, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor

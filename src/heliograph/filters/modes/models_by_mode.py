@@ -9,7 +9,7 @@ from heliograph.filters.base import make_sizes
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import SideInformation, describe_by_pattern
 from heliograph.model.channel import Channel, check_link, find_received_angles
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, models_of
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, models_of
 from heliograph.model.over_time import OverTime, first, restack, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor

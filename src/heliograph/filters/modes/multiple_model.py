@@ -53,7 +53,7 @@ from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over
+from heliograph.model.markov_jump_models import ModalPlant, models_of, transition_over
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import believes

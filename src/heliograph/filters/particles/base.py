@@ -15,7 +15,7 @@ from heliograph.filters.particles.moments import StateSums
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor

@@ -10,7 +10,7 @@ from heliograph.filters.particles.affine_check import is_affine
 from heliograph.filters.particles.partly_drawn import PartlyDrawnFilter
 from heliograph.filters.particles.received_density import find_received_density
 from heliograph.model.channel import Channel, check_link, find_received_angles
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import first, list_steps, restack, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor

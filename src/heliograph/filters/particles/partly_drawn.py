@@ -43,7 +43,7 @@ from heliograph.filters.particles.proposal import PRIOR_SHARE, noise_columns
 from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor

@@ -25,9 +25,9 @@ from heliograph.filters.linear.belief import LinearBelief, PlantMotion, predict_
 from heliograph.filters.linear.plan import PlannedFilter, plan_filter
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.augmented.bias import append_driving_plant
+from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link, delayed
-from heliograph.model.enlarged.bias import append_driving_plant
-from heliograph.model.enlarged.past_outputs import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant

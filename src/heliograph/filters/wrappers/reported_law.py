@@ -23,11 +23,11 @@ from heliograph.filters.base import (
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
+from heliograph.model.channel_side_information import separate_told
 from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import on_premise
-from heliograph.model.reported_numbers import separate_told
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.checks.row_times import check_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, check_columns, fail, show_value
 from heliograph.numerics.masked import fill_masked

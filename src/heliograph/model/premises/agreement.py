@@ -9,18 +9,18 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
+from heliograph.model.augmented.joint_sensors import JointSensor, join_links
+from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint_sensors import JointSensor, join_links
-from heliograph.model.enlarged.past_outputs import with_past
+from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.fading import memory_matters, without_memory
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, at_each_step, first, steps_covered, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
 from heliograph.model.premises.premise import MEAN_AND_COVARIANCE, Premise
 from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.module import are_same
 from heliograph.numerics.traced import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine

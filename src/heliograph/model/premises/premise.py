@@ -9,13 +9,13 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from heliograph.model.channel import Channel, perfect
-from heliograph.model.limits import Limits
+from heliograph.model.diffuse_start import TAKEN_BY, UnknownStart
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.reading_limits import Limits
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
-from heliograph.model.unknown_start import TAKEN_BY, UnknownStart
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable

@@ -13,10 +13,10 @@ import numpy as np
 import scipy
 
 from heliograph.filters.wrappers.reported_law import ToldFilter
-from heliograph.model.enlarged.bias import with_bias
+from heliograph.model.augmented.bias import with_bias
+from heliograph.model.channel_side_information import LinkGivenNumbers
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
-from heliograph.model.reported_numbers import LinkGivenNumbers
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float

@@ -11,10 +11,10 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear import SEEN
 from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
+from heliograph.model.channel_side_information import separate_told
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
-from heliograph.model.reported_numbers import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.traced import DOUBLE

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.transform import AbstractTransform, Linearization
 from heliograph.filters.wrappers.state_limits import LimitedFilter
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import first
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear

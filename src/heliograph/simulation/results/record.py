@@ -82,7 +82,7 @@ class Record(Saved):
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
             was sent, negative where it was lost, 0 where it was not sent.
         refused: of a recording, by node that refused any, the number of the reason for which a reading that came counts
-            as missing (`model.checks.refusals`), 0 where it does not, (time, received); `refusals` counts them.
+            as missing (`model.checks.refusal_reasons`), 0 where it does not, (time, received); `refusals` counts them.
         weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
         origin: of what `hg.run` returns, the filters' last states, from which `hg.forecast` predicts; not saved.

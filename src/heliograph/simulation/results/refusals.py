@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliograph.filters.innovation import Weighed
-from heliograph.model.checks.refusals import Reason, count_by_reason, number_of
+from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of
 from heliograph.numerics.module import readable
 
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.channel import Channel, parallel
+from heliograph.model.input_dependent_sensor import NoiseOfInputs
 from heliograph.model.over_time import at_each_step
 from heliograph.model.plant import split_inputs
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
-from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import fail, instance, names, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import block_diagonal, library

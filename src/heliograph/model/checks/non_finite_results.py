@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.checks.inputs import parts_in, plants_in
+from heliograph.model.checks.plant_inputs import parts_in, plants_in
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.checks.inputs import do_inputs_spoil, find_wrong_covariances
+from heliograph.model.checks.plant_inputs import do_inputs_spoil, find_wrong_covariances
 
 BACKWARDS, WRAPPED, HUGE = -1.0, 2.0**32 - 1, 1e30
 

@@ -7,8 +7,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
-from heliograph.model.checks.refusals import Reason, number_of
-from heliograph.model.intervals import read_intervals, read_numbers
+from heliograph.model.checks.refusal_reasons import Reason, number_of
+from heliograph.model.limit_arguments import read_intervals, read_numbers
 from heliograph.model.repeated_readings import Repeats, StuckLike, count_repeats, stuck_counts
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, show_value
@@ -51,7 +51,7 @@ class ScreenedReadings(NamedTuple):
 
     Args:
         values: the readings (time, m), NaN where one counts as missing.
-        refused: the number of each one's reason (`model.checks.refusals`), 0 where it is kept (time, m).
+        refused: the number of each one's reason (`model.checks.refusal_reasons`), 0 where it is kept (time, m).
         repeats: runs of equal readings that end with the last ones.
     """
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.enlarged.bias import append_driving_plant
+from heliograph.model.augmented.bias import append_driving_plant
 from heliograph.model.plant import AbstractPlant, LinearPlant, Plant
 from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table

@@ -6,8 +6,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from heliograph.model.diffuse_start import DiffuseStart
 from heliograph.model.plant import LinearPlant
-from heliograph.model.unknown_start import DiffuseStart
 from heliograph.models.motion import WIDE
 from heliograph.numerics.check import array, check_count, fail, instance, items, name_list, scalar, text
 from heliograph.numerics.module import Module, readable

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.input_dependent_sensor import NoiseOfInputs
+from heliograph.model.markov_jump_models import models_of
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
-from heliograph.model.sensor_inputs import NoiseOfInputs
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.linalg import rounding
