@@ -15,9 +15,9 @@ from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.model.checks.non_finite_results import find_function_fault
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Float
-from heliograph.simulation.description.wide_angles import WideAngles
+from heliograph.simulation.description.angle_doubts import WideAngles
 from heliograph.simulation.network import Network
-from heliograph.simulation.rows.columns import FilterColumns
+from heliograph.simulation.rows.output_columns import FilterColumns
 
 TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]

@@ -24,7 +24,7 @@ from heliograph.model.repeated_readings import Repeats, StuckLike
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.description.wide_angles import WideAngles
+from heliograph.simulation.description.angle_doubts import WideAngles
 
 COUNTED: tuple[Reason, ...] = (*SCREENED, "gate")
 BEYOND = 10  # measurements in a row, each beyond what an honest filter sees with probability RARE

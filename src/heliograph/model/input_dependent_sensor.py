@@ -1,5 +1,6 @@
-"""What of a sensor depends on inputs: its function, matrix and noise, each a function of them."""
+"""Sensors whose function, matrix or noise depends on inputs u: h(x, u), C(u), R(u); and what those without refuse."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.plant import NoiseFunction, check_shape
-from heliograph.numerics.check import array, error_text, fail, name_list, names
+from heliograph.numerics.check import array, error_text, fail, function, name_list, names
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import as_real, trace_shape
 from heliograph.numerics.types import ArrayLike, Names
@@ -86,3 +87,26 @@ def read_noise_of_inputs(
     law = NoiseOfInputs(noise, inputs, count)
     check_shape("sensor noise covariance(u)", law.given, (np.ones(len(inputs)),), (count, count))
     return named, law
+
+
+def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
+    """Return a sensor's function h(x); raise ValueError where it needs more arguments than the state."""
+    checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
+    try:
+        signature = inspect.signature(checked)
+    except ValueError:  # of what is not Python, nothing is known before it is called
+        return checked
+    try:
+        signature.bind(None)
+    except TypeError:
+        expected = "a function of x alone, or inputs=[...], the names of those that a function of (x, u) takes"
+        raise fail("measure of a sensor", expected, f"one of {signature}") from None
+    return checked
+
+
+def require_constant(name: str, value: object) -> Any:
+    """Return a sensor's matrix or noise as it is; raise ValueError for a function, whose inputs have no names."""
+    if callable(value):
+        expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
+        raise fail(name, expected, "a function")
+    return value

@@ -1,6 +1,5 @@
 """Sensors: y = h(x) + v."""
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -15,7 +14,9 @@ from heliograph.model.input_dependent_sensor import (
     NoiseOfInputs,
     count_rows,
     name_inputs,
+    read_function_of_state_alone,
     read_noise_of_inputs,
+    require_constant,
 )
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
@@ -151,7 +152,7 @@ class Sensor(AbstractSensor):
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
         # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
-        self.function, law = _take_state_alone(measure), _require_constant("sensor noise", noise)
+        self.function, law = read_function_of_state_alone(measure), require_constant("sensor noise", noise)
         count = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", law, count)
         self.outputs = names("sensor outputs", outputs, count, "y")
@@ -213,8 +214,8 @@ class LinearSensor(AbstractSensor):
             self.circular = read_angles("circular outputs", circular, self.outputs)
             self.noise = _round_to(self.noise, resolution, self.circular)
             return
-        self.matrix = array("sensor matrix", _require_constant("sensor matrix", matrix), ("outputs", "states"))
-        self.noise = as_noise("sensor noise", _require_constant("sensor noise", noise), self.matrix.shape[-2])
+        self.matrix = array("sensor matrix", require_constant("sensor matrix", matrix), ("outputs", "states"))
+        self.noise = as_noise("sensor noise", require_constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_to(self.noise, resolution, self.circular)
@@ -259,29 +260,6 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
 def _sensor_under_inputs(sensor: AbstractSensor, u: Array) -> AbstractSensor:
     """Return the sensor under its inputs u, computed in double precision."""
     return sensor.given(jnp.asarray(u))
-
-
-def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
-    """Return a function of the state alone, refused where it needs anything else."""
-    checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
-    try:
-        signature = inspect.signature(checked)
-    except ValueError:  # of what is not Python, nothing is known before it is called
-        return checked
-    try:
-        signature.bind(None)
-    except TypeError:
-        expected = "a function of x alone, or inputs=[...], the names of those that a function of (x, u) takes"
-        raise fail("measure of a sensor", expected, f"one of {signature}") from None
-    return checked
-
-
-def _require_constant(name: str, value: object) -> Any:
-    """Return a constant; raise ValueError where it is a function of inputs that have no names."""
-    if callable(value):
-        expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
-        raise fail(name, expected, "a function")
-    return value
 
 
 def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:

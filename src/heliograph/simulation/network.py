@@ -25,8 +25,7 @@ from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
 from heliograph.random_affine.memory import memories
 from heliograph.simulation.centres.mesh_check import check_mesh
-from heliograph.simulation.channel_flags import check_flags
-from heliograph.simulation.claims import (
+from heliograph.simulation.covariance_claims import (
     OtherBelief,
     find_claims,
     list_other_beliefs,
@@ -38,6 +37,7 @@ from heliograph.simulation.claims import (
     pad_filters_alike,
 )
 from heliograph.simulation.description.diagram import short_text_of, text_of, write_html_table
+from heliograph.simulation.mode_flag_check import check_flags
 from heliograph.simulation.network_index import (
     EstimatePlace,
     FilterKind,

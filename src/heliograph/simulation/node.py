@@ -27,7 +27,7 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memory import drop_names
-from heliograph.simulation.channel_flags import check_flags
+from heliograph.simulation.mode_flag_check import check_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,
     check_trigger,

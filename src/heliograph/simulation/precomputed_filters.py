@@ -11,8 +11,8 @@ from heliograph.engine.choice import choose_code, compute_once, map_arrays
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.simulation.runs.side_by_side import StackedFilters, map_all
-from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters, map_all
 from heliograph.smoothing.backward_pass import plan_with_past
 
 

@@ -22,13 +22,13 @@ from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
 from heliograph.simulation.precomputed_filters import has_plan, plan_filters
-from heliograph.simulation.results.no_numbers import warn_of_no_numbers
+from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.runs.lanes import (
     LANES,
     RunLanes,
@@ -41,9 +41,9 @@ from heliograph.simulation.runs.lanes import (
 )
 from heliograph.simulation.runs.memory import NeededMemory, check_memory, count_bytes, explain_out_of_memory
 from heliograph.simulation.runs.native import simulate_natively
+from heliograph.simulation.runs.xla_runs import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.simulation_step import World
 from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 

@@ -14,15 +14,15 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
-from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.transmission.reception import AbstractMedium
-from heliograph.simulation.transmission.shared_fading import (
+from heliograph.simulation.transmission.channel_draws import (
     PLANT,
     move_modes,
     number_memories,
     start_modes,
 )
+from heliograph.simulation.transmission.reception import AbstractMedium
 from straightline import present
 
 

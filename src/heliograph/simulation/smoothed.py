@@ -22,6 +22,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import FUSED, Claims, Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import (
     AbstractReducer,
@@ -31,7 +32,6 @@ from heliograph.simulation.results.reducer import (
     reduce_rows,
     trajectories_record,
 )
-from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis_sums, warn_if_inconsistent
 
 

@@ -22,7 +22,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import find_source_filters
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 
 UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
 WHOLE = Gaussian, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x

@@ -19,14 +19,14 @@ from heliograph.model.over_time import at, first, stack, structure_key
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.centre import (
+from heliograph.simulation.centres.fusion_centre import (
     CentreFilter,
     FusionCentre,
     NodesFilters,
     find_claim_of_report_fusion,
     has_data_dependent_gains,
 )
-from heliograph.simulation.centres.linearised import LinearisedCentre
+from heliograph.simulation.centres.linearised_centre import LinearisedCentre
 from heliograph.simulation.centres.observation_model import (
     SeparateObservations,
     SharedObservation,
@@ -37,7 +37,7 @@ from heliograph.simulation.centres.uplinks import ReportsInTransit, UplinkDraws,
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.runs.side_by_side import initial_state, map_all
+from heliograph.simulation.runs.stacked_filters import initial_state, map_all
 
 
 class StackedFusions(Module):

@@ -26,7 +26,14 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.mesh_parts import (
+from heliograph.simulation.centres.late_and_quantized_messages import (
+    ArrivingEstimates,
+    MessagesOnTheWay,
+    find_moved_beyond,
+    gather_messages,
+    step_messages_on_the_way,
+)
+from heliograph.simulation.centres.mesh_state_and_step import (
     Ahead,
     Arrived,
     MeshState,
@@ -39,13 +46,6 @@ from heliograph.simulation.centres.mesh_parts import (
     widen_for_events,
 )
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
-from heliograph.simulation.centres.neighbour_messages import (
-    ArrivingEstimates,
-    MessagesOnTheWay,
-    find_moved_beyond,
-    gather_messages,
-    step_messages_on_the_way,
-)
 from heliograph.simulation.centres.observation_model import SeparateObservations
 
 

@@ -33,7 +33,7 @@ from heliograph.simulation.arguments import make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import find_claim_of_errors
-from heliograph.simulation.centres.mesh_parts import MeshStep
+from heliograph.simulation.centres.mesh_state_and_step import MeshStep
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
 

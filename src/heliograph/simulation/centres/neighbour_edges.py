@@ -25,7 +25,7 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.transmission.shared_fading import (
+from heliograph.simulation.transmission.channel_draws import (
     ChannelGroup,
     channel_groups,
     deliver_signal,

@@ -22,11 +22,11 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.centre import FusionCentre
+from heliograph.simulation.centres.fusion_centre import FusionCentre
 from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, describe_channel
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 
 BLOCK = 1000  # nodes that are followed together
 

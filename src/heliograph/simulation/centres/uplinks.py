@@ -24,7 +24,7 @@ from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph.simulation.centres.observation_model import describe_channel
 from heliograph.simulation.random_keys import CHANNEL, draw_key
-from heliograph.simulation.transmission.shared_fading import ChannelGroup, channel_groups
+from heliograph.simulation.transmission.channel_draws import ChannelGroup, channel_groups
 
 
 class UplinkDraws(NamedTuple):

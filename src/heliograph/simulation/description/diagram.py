@@ -13,10 +13,10 @@ from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.traced import describe_rounded, is_traced
 from heliograph.random_affine.composite import ARROW, DIRECT
 from heliograph.random_affine.memory import memories
-from heliograph.simulation.claims import list_other_beliefs
-from heliograph.simulation.description.single_precision_numbers import find_rounded_parts
+from heliograph.simulation.covariance_claims import list_other_beliefs
+from heliograph.simulation.description.rounded_to_single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
-from heliograph.simulation.transmission.shared_fading import number_memories
+from heliograph.simulation.transmission.channel_draws import number_memories
 
 
 class DiagramLine(NamedTuple):

@@ -23,16 +23,16 @@ from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.reported_law import told_maps
 from heliograph.random_affine.superposed import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
-from heliograph.simulation.claims import OtherBelief, list_other_beliefs
-from heliograph.simulation.declared.refit import list_declaring
+from heliograph.simulation.covariance_claims import OtherBelief, list_other_beliefs
+from heliograph.simulation.declared_noise.refit import list_declaring
+from heliograph.simulation.description.angle_doubts import warn_degrees_at_start, warn_wide_at_start
 from heliograph.simulation.description.diagram import list_rounded, list_shared
-from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
 from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
-from heliograph.simulation.description.separable import separate_nodes
-from heliograph.simulation.description.wide_angles import warn_degrees_at_start, warn_wide_at_start
+from heliograph.simulation.description.separable_nodes import separate_nodes
+from heliograph.simulation.description.slow_filters import list_fallbacks, list_sequential
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.overloads import find_overloads
+from heliograph.simulation.results.overloaded_words import find_overloads
 
 CANCELLED = 1e-12  # of the largest mean gain: what is left where gains cancel
 HIDDEN = 1e-9  # of the largest singular value of the observability matrix: what is smaller is rounding

@@ -16,12 +16,12 @@ from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import split_by_name, uplinks_by_name
+from heliograph.simulation.results.error_statistics_by_name import StatisticsByName
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, reduce_rows
+from heliograph.simulation.results.results_by_name import split_by_name, uplinks_by_name
 from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
-from heliograph.simulation.results.statistics_by_name import StatisticsByName
-from heliograph.simulation.runs.over_runs import over_runs
+from heliograph.simulation.runs.map_over_runs import over_runs
 
 
 class RunSums(NamedTuple):

@@ -19,7 +19,7 @@ from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees
-from heliograph.simulation.results.labelled import (
+from heliograph.simulation.results.labelled_datasets import (
     TIME,
     FilterLabels,
     check_title,
@@ -32,7 +32,7 @@ from heliograph.simulation.results.labelled import (
     read_uplinks,
     read_values,
 )
-from heliograph.simulation.results.overloads import Overloads, find_overloads
+from heliograph.simulation.results.overloaded_words import Overloads, find_overloads
 from heliograph.simulation.results.plots import (
     check_run,
     choose_filters,
@@ -44,8 +44,8 @@ from heliograph.simulation.results.plots import (
     make_panels,
 )
 from heliograph.simulation.results.record_html import draw_record
-from heliograph.simulation.results.refusals import Refusal, list_refusals
-from heliograph.simulation.results.saved import Saved
+from heliograph.simulation.results.refusal_counts import Refusal, list_refusals
+from heliograph.simulation.results.saved_datasets import Saved
 from heliograph.simulation.results.wide_table import make_frame, read_frame
 
 if TYPE_CHECKING:  # extras

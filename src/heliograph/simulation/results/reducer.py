@@ -16,7 +16,8 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import (
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.results_by_name import (
     collect_modes,
     collect_weighed,
     reports_by_name,
@@ -25,7 +26,6 @@ from heliograph.simulation.results.by_name import (
     transmissions_by_name,
     uplinks_by_name,
 )
-from heliograph.simulation.results.record import Record
 
 Result = TypeVar("Result", default=Record)  # of the reducer; a record where there is none
 

@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.runs.side_by_side import filter_step, map_all
+from heliograph.simulation.runs.stacked_filters import filter_step, map_all
 
 
 def refuse_centrally(

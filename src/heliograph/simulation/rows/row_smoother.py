@@ -24,11 +24,11 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
+from heliograph.simulation.implausible_data import read_reasons
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import read_reasons
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
-from heliograph.simulation.stepping import AllFilters
 
 NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
 

@@ -17,12 +17,12 @@ from heliograph.numerics.trees.flat import FlatLayout, flatten_to_row, make_flat
 from heliograph.numerics.trees.program_text import write_program_text
 from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.description.remarks import find_remarking, list_remarks
+from heliograph.simulation.description.filter_remarks import find_remarking, list_remarks
+from heliograph.simulation.implausible_data import step_plausibly
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import step_plausibly
-from heliograph.simulation.rows.columns import find_filter_columns
+from heliograph.simulation.network_filters import AllFilters, initial_states
+from heliograph.simulation.rows.output_columns import find_filter_columns
 from heliograph.simulation.rows.row_history import RowHistory
-from heliograph.simulation.stepping import AllFilters, initial_states
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each

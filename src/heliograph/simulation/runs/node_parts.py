@@ -14,11 +14,11 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_identities
 from heliograph.simulation.network import Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.network_index import FilterKind, find_estimate_places
 from heliograph.simulation.node import Node
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.simulation.transmission.reception import SeparateChannels
 

@@ -14,6 +14,7 @@ from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import checksum
+from heliograph.simulation.transmission.channel_draws import number_memories
 from heliograph.simulation.transmission.reception import (
     AbstractMedium,
     CommonChannel,
@@ -21,7 +22,6 @@ from heliograph.simulation.transmission.reception import (
     NoSensor,
     SeparateChannels,
 )
-from heliograph.simulation.transmission.shared_fading import number_memories
 from heliograph.simulation.transmission.slotted_relays import SlottedRelays, find_hops_with_memory
 
 

@@ -28,8 +28,8 @@ from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
-from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.transmission.shared_fading import deliver_signal, move_modes, start, start_modes
+from heliograph.simulation.runs.stacked_filters import map_all
+from heliograph.simulation.transmission.channel_draws import deliver_signal, move_modes, start, start_modes
 
 Measurements = tuple[jax.Array, ...]  # (node, received) of each group
 

@@ -16,8 +16,8 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
+from heliograph.simulation.transmission.channel_draws import deliver_signal, start
 from heliograph.simulation.transmission.reception import AbstractMedium, Measurements
-from heliograph.simulation.transmission.shared_fading import deliver_signal, start
 
 
 class RelayStates(NamedTuple):

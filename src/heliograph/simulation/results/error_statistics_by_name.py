@@ -11,7 +11,7 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in
 from heliograph.simulation.network import FUSED
-from heliograph.simulation.results.labelled import (
+from heliograph.simulation.results.labelled_datasets import (
     TIME,
     FilterLabels,
     check_title,
@@ -29,7 +29,7 @@ from heliograph.simulation.results.plots import (
     legend_outside,
     make_panels,
 )
-from heliograph.simulation.results.saved import Saved
+from heliograph.simulation.results.saved_datasets import Saved
 from heliograph.simulation.results.statistics import ErrorStatistics, expand_pairs
 
 if TYPE_CHECKING:  # extras

@@ -13,10 +13,10 @@ from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.plausible_step import step_plausibly
+from heliograph.simulation.implausible_data import step_plausibly
+from heliograph.simulation.network_filters import AllFilters, initial_states
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import NetworkSmoother
-from heliograph.simulation.stepping import AllFilters, initial_states
 
 EXPECTED = "what hg.run of this network returned for the rows before"
 ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time

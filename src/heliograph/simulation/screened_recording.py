@@ -10,9 +10,9 @@ from heliograph.model.reading_limits import Limits
 from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.types import Float, Int
+from heliograph.simulation.implausible_data import find_forbidden_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.plausible_step import find_forbidden_rows
 
 
 class ScreenedRecording(NamedTuple):

@@ -24,7 +24,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.centre import gather_steps
+from heliograph.simulation.centres.fusion_centre import gather_steps
 
 
 class LinearisedFusionState(NamedTuple):

@@ -17,12 +17,12 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.centre import (
+from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
+from heliograph.simulation.centres.fusion_centre import (
     CentreFilter,
     CentreState,
     FusionCentre,
 )
-from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
 from heliograph.simulation.centres.fusions import (
     ReportFusion,
     StackedFusions,
@@ -31,12 +31,12 @@ from heliograph.simulation.centres.fusions import (
     list_centres,
     list_stacked_fusions,
 )
-from heliograph.simulation.centres.linearised import LinearisedCentre, LinearisedFusionState
+from heliograph.simulation.centres.linearised_centre import LinearisedCentre, LinearisedFusionState
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_index import find_measurement_order
-from heliograph.simulation.runs.side_by_side import (
+from heliograph.simulation.runs.stacked_filters import (
     StackedFilters,
     StepOutput,
     filter_step,

@@ -15,9 +15,9 @@ from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.stepping import AllFilters
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
 

@@ -24,7 +24,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 from heliograph.random_affine.reported_law import AbstractTold, ToldGainHop, ToldMap, numbers_of_outputs, told_maps
 from heliograph.simulation.likelihood import log_likelihood
-from heliograph.simulation.runs.over_runs import over_runs
+from heliograph.simulation.runs.map_over_runs import over_runs
 
 ALMOST = 2**-20  # by which typical numbers are moved, to see whether a noise depends on them
 REACH = 1.92  # nats below the maximum at the ends of a 95 % interval of one number: half of chi-squared's 3.84

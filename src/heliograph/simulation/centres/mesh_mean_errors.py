@@ -39,7 +39,7 @@ from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_check import find_claim_of_errors
 from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
-from heliograph.simulation.centres.mesh_parts import MeshStep, NodeBucket
+from heliograph.simulation.centres.mesh_state_and_step import MeshStep, NodeBucket
 from heliograph.simulation.centres.neighbour_edges import find_arrival_probability, links_by_edge
 from heliograph.simulation.network import Network
 

@@ -18,17 +18,22 @@ from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, PyTree, units_in
 from heliograph.simulation.arguments import read_measurements, read_plant_inputs
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.description.possible import doubt_estimates
-from heliograph.simulation.description.remarks import say_remarks
-from heliograph.simulation.description.wide_angles import warn_beyond_a_turn, warn_wide_in_rows
-from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.plausible_step import (
+from heliograph.simulation.description.angle_doubts import warn_beyond_a_turn, warn_wide_in_rows
+from heliograph.simulation.description.doubtful_estimates import doubt_estimates
+from heliograph.simulation.description.filter_remarks import say_remarks
+from heliograph.simulation.implausible_data import (
     FilterJudges,
     any_implausible,
     describe_doubts,
     find_refused_rows,
 )
-from heliograph.simulation.recorded_rows import (
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.reducer import trajectories_record
+from heliograph.simulation.rows.implausible_node import refuse_centrally
+from heliograph.simulation.scan_recording import (
     FilteringTask,
     RecordingStart,
     filter_rows,
@@ -36,13 +41,8 @@ from heliograph.simulation.recorded_rows import (
     join_behind,
     read_origin,
 )
-from heliograph.simulation.results.no_numbers import warn_of_no_numbers
-from heliograph.simulation.results.record import Record
-from heliograph.simulation.results.reducer import trajectories_record
-from heliograph.simulation.rows.implausible_node import refuse_centrally
-from heliograph.simulation.screened import screen_recording
+from heliograph.simulation.screened_recording import screen_recording
 from heliograph.simulation.smoothed import SmoothingPlan, add_truth, make_smoothed_record, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.shared_dithers import refuse_shared_dithers
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 

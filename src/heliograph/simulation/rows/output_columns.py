@@ -12,7 +12,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.trees.flat import FlatLayout
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import collect_modes, split_by_name
+from heliograph.simulation.results.results_by_name import collect_modes, split_by_name
 
 
 class JudgementColumns(NamedTuple):

@@ -17,7 +17,7 @@ from heliograph.model.estimate import Claim
 from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, restrict_premise_to_rows
 from heliograph.model.premises.premise import Premise, StaticPremise
 from heliograph.numerics.check import fail
-from heliograph.simulation.centres.centre import (
+from heliograph.simulation.centres.fusion_centre import (
     find_claim_of_informed_fusion,
     find_claim_of_report_fusion,
     has_data_dependent_gains,

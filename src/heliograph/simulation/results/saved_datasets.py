@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.disk.quoting import quote_for_file, unquote_file
 from heliograph.disk.whole_file import check_replaceable, check_writable, whole_file, whole_folder
 from heliograph.numerics.check import fail, file_path
-from heliograph.simulation.results.labelled import check_units
+from heliograph.simulation.results.labelled_datasets import check_units
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr

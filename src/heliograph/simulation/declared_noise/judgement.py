@@ -17,8 +17,8 @@ from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.random_affine.reported_law import AbstractTold
-from heliograph.simulation.declared.innovation_tests import LEVEL, InnovationTests, examine_innovations
-from heliograph.simulation.declared.refit import (
+from heliograph.simulation.declared_noise.innovation_tests import LEVEL, InnovationTests, examine_innovations
+from heliograph.simulation.declared_noise.refit import (
     DeclaredRows,
     LinkPlace,
     Refit,
@@ -30,7 +30,7 @@ from heliograph.simulation.declared.refit import (
     refit_scales,
     refit_with_bias,
 )
-from heliograph.simulation.runs.over_runs import over_runs
+from heliograph.simulation.runs.map_over_runs import over_runs
 
 FEWEST = 20  # rows with values, below which nothing is judged
 MOST = 2000  # rows that decide

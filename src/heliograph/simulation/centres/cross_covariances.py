@@ -19,8 +19,8 @@ from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.observation_model import SharedObservation
 from heliograph.simulation.network import Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.precomputed_filters import plan_filters
-from heliograph.simulation.stepping import AllFilters
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 

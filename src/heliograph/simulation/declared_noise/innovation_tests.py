@@ -8,7 +8,7 @@ import scipy
 from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import Float, Int
-from heliograph.simulation.declared.refit import DeclaredRows
+from heliograph.simulation.declared_noise.refit import DeclaredRows
 from heliograph.simulation.results.whiteness import whitened_innovations
 
 LEVEL = 0.01  # of each test
