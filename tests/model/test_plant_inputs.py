@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.model.checks.plant_inputs import do_inputs_spoil, find_wrong_covariances
+from heliograph.model.checks.plant_inputs import do_inputs_spoil, mask_invalid_covariances
 
 BACKWARDS, WRAPPED, HUGE = -1.0, 2.0**32 - 1, 1e30
 
@@ -190,7 +190,7 @@ def test_the_test_in_a_step_agrees_with_that_of_all_rows():
                 plant = hg.LinearPlant(np.eye(n), lambda u, m=matrix: jnp.asarray(m), np.zeros(n), 1.0, inputs=["s"])
                 with jax.enable_x64(True):
                     spoilt = do_inputs_spoil(plant, ("s",), jnp.zeros(1), 0)
-                assert bool(spoilt) == find_wrong_covariances(matrix[None])[0]
+                assert bool(spoilt) == mask_invalid_covariances(matrix[None])[0]
 
 
 STATE, START = np.zeros((3, 1)), ([0.0, 0.0], np.eye(2))

@@ -8,7 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor, check_sensor
 from heliograph.numerics.check import fail, flag, instance
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -31,7 +31,7 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
     """
     if memories((plant, sensor)):
         return imm_filter(plant, sensor, channel)
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     check_sensor(first(sensor), len(start.states))
     link = instance("channel", first(channel), AbstractRandomAffine, "a channel")
     if isinstance(start.initial_covariance, UnknownStart):

@@ -12,7 +12,7 @@ from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.sorted_rows import BEFORE, HeldRow
-from heliograph.model.checks.non_finite_results import find_function_fault
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Float
 from heliograph.simulation.description.angle_doubts import WideAngles
@@ -138,7 +138,7 @@ class JudgementReader:
             if not sentence and tries < TRIES:
                 inputs, step = self.fleet.pool.inputs_between(row_before.slot, row.slot)
                 estimate = self._estimate_after(row_before, filter, columns)
-                sentence = find_function_fault(filter, estimate, inputs, step)
+                sentence = describe_non_finite_function(filter, estimate, inputs, step)
                 self._faults[columns.node, columns.filter] = tries + 1, sentence
             if sentence:
                 return f"; {sentence}"

@@ -6,7 +6,7 @@ from math import ceil, inf, log
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.markov_jump_models import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import unstack
 from heliograph.model.repeated_readings import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
 from heliograph.model.sensor import AbstractSensor, AnySensor
@@ -42,7 +42,7 @@ class RepeatWatch:
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
             return None
-        if any(len(models_of(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
+        if any(len(list_mode_models(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
             return None
         outputs = tuple(range(received))
         if len(steps[0].outputs) != received or not all(delivers_as_sent(link, outputs) for link in unstack(channel)):

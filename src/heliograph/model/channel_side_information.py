@@ -102,7 +102,9 @@ def told(
     if memory.announced != len(names) or len(set(names)) < len(names):
         raise fail("numbers told", f"{memory.announced} different names", list(names))
     example = array("typical numbers", _average_law(law, memory) if typical is None else typical, (len(names),))
-    return deliver_told(ToldMap(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh)))
+    return append_told_numbers(
+        ToldMap(memory, link, example, names, flag("exogenous", exogenous), flag("fresh", fresh))
+    )
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
@@ -124,18 +126,20 @@ def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
 KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pilot, or not at all
 
 
-def tell_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
+def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
     """Return the hop with its gain, or a pilot's reading of it, after z; the hop itself where neither is known."""
     if known is False:
         return hop
     if isinstance(known, Pilot):
-        return deliver_told(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise, known.fresh))
+        return append_told_numbers(PilotedHop(FreshReading(hop.law, known.noise), hop.matrix, hop.noise, known.fresh))
     instance("known", known, bool, "True, False or a Pilot")
     typical = np.asarray([hop.law.moment(1)])
-    return deliver_told(ToldMap(FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise), typical, ("gain",)))
+    return append_told_numbers(
+        ToldMap(FreshNumbers(hop.law, 1), ToldGainHop(hop.matrix, hop.noise), typical, ("gain",))
+    )
 
 
-def deliver_told(link: AbstractRandomAffine) -> Stack:
+def append_told_numbers(link: AbstractRandomAffine) -> Stack:
     """Return a link with the numbers that are told of its maps after z."""
     return Stack([link, *_list_told_outputs(link, link.inputs)])
 
@@ -145,7 +149,7 @@ def _list_told_outputs(link: AbstractRandomAffine, sent: int) -> list[ModeOutput
     return [ModeOutput(affine.memory, sent) for affine in told_maps(link)]
 
 
-class SeparatedTold(NamedTuple):
+class SeparatedToldNumbers(NamedTuple):
     """A channel taken apart: the link of the values, and the rows of z in which values and told numbers stand.
 
     Numbers are in the order of the link's `told_maps`, each once.
@@ -156,7 +160,7 @@ class SeparatedTold(NamedTuple):
     numbers: tuple[int, ...]
 
 
-def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
+def separate_told_numbers(channel: AbstractRandomAffine) -> SeparatedToldNumbers:
     """Take a channel apart into its link, the rows of its outputs, and the rows of the numbers told about it.
 
     A channel that tells nothing is its own link, and all its rows are outputs.
@@ -174,25 +178,27 @@ def separate_told(channel: AbstractRandomAffine) -> SeparatedTold:
             links.append(part)
             values += places
     if not rows:
-        return SeparatedTold(channel, values, ())
+        return SeparatedToldNumbers(channel, values, ())
     link = links[0] if len(links) == 1 else Stack(links)
     numbers = [row for affine in told_maps(link) for row in rows[affine.memory.identity]]
-    return SeparatedTold(link, values, tuple(numbers))
+    return SeparatedToldNumbers(link, values, tuple(numbers))
 
 
-def build_with_told(build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]) -> M:
+def build_with_told_numbers(
+    build: Callable[[list[AbstractRandomAffine]], M], channels: Sequence[AbstractRandomAffine]
+) -> M:
     """Return what `build` makes of channels, and behind its outputs all numbers that the channels tell the receiver.
 
     A channel may tell numbers about itself beside each message, such as its present gain. These do not go through what
     is built: `build` gets the links without them, and they are delivered as they are.
     """
-    links = [separate_told(channel).link for channel in channels]
+    links = [separate_told_numbers(channel).link for channel in channels]
     built = build(links)
     some_tell = any(link is not channel for link, channel in zip(links, channels, strict=True))
-    return cast(M, deliver_told(built)) if some_tell else built
+    return cast(M, append_told_numbers(built)) if some_tell else built
 
 
-def stack_with_told(
+def stack_channels_with_told_numbers(
     place: Callable[[list[AbstractRandomAffine]], list[AbstractRandomAffine]], channels: Sequence[AbstractRandomAffine]
 ) -> Stack:
     """Return channels side by side, each one's told numbers after its own outputs, as its receiver gets them.
@@ -204,14 +210,14 @@ def stack_with_told(
             other.
         channels: the channels.
     """
-    links = [separate_told(channel).link for channel in channels]
+    links = [separate_told_numbers(channel).link for channel in channels]
     placed, maps = place(links), list[AbstractRandomAffine]()
     for link, channel, of_all in zip(links, channels, placed, strict=True):
         maps += [of_all] if link is channel else [of_all, *_list_told_outputs(of_all, of_all.inputs)]
     return Stack(maps)
 
 
-def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more: int = 0) -> tuple[str, ...]:
+def name_received_values(outputs: tuple[str, ...], channel: AbstractRandomAffine, more: int = 0) -> tuple[str, ...]:
     """Return names of what is received: of values those of the outputs where these are as many, else z0, z1, ...
 
     Args:
@@ -219,7 +225,7 @@ def name_received(outputs: tuple[str, ...], channel: AbstractRandomAffine, more:
         channel: from the sensor to the receiver; told numbers have names of their own.
         more: how many numbers are received beside what the channel delivers.
     """
-    link, values, numbers = separate_told(channel)
+    link, values, numbers = separate_told_numbers(channel)
     count = len(values) + more
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
     told_names = [name for affine in told_maps(link) for name in affine.names] if numbers else []

@@ -122,7 +122,7 @@ def weakest(claims: list[Claim]) -> Claim:
     return min(claims, key=STRENGTH.__getitem__)
 
 
-def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
+def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
     """Lower a claim to what the noises of these models support.
 
     "upper" where one is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps of
@@ -149,11 +149,11 @@ def _are_covariances(bound: np.ndarray) -> np.ndarray:
     if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
         rows = bound.reshape(len(bound), -1)
         changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
-        return np.asarray(_judge_covariances(bound[changes])[np.cumsum(changes) - 1])
-    return _judge_covariances(bound)
+        return np.asarray(_judge_covariances_one_by_one(bound[changes])[np.cumsum(changes) - 1])
+    return _judge_covariances_one_by_one(bound)
 
 
-def _judge_covariances(bound: np.ndarray) -> np.ndarray:
+def _judge_covariances_one_by_one(bound: np.ndarray) -> np.ndarray:
     """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, judged one by one."""
     finite = ~find_not_finite(bound, 2)
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):

@@ -17,7 +17,7 @@ from heliograph.numerics.types import ArrayLike, Names
 from heliograph.random_affine.noise import as_noise, count_components
 
 
-class GivenInputs(Module):
+class MeasureUnderInputs(Module):
     """x -> h(x, u) of a known u."""
 
     function: Callable[..., ArrayLike]
@@ -55,12 +55,12 @@ class NoiseOfInputs(Module):
     covariance = mean = columns = dimension = property(_refuse)
 
 
-def name_inputs(inputs: Names) -> tuple[str, ...]:
+def read_input_names(inputs: Names) -> tuple[str, ...]:
     """Return names of inputs, each once."""
     return names("inputs of a sensor", inputs, len(name_list("inputs of a sensor", inputs)), "u")
 
 
-def count_rows(matrix: object, inputs: tuple[str, ...]) -> int:
+def count_matrix_rows(matrix: object, inputs: tuple[str, ...]) -> int:
     """Return the number of rows of a matrix, or of what a function of the inputs returns."""
     if not callable(matrix):
         return int(array("sensor matrix", cast(ArrayLike, matrix), ("outputs", "states")).shape[-2])

@@ -87,7 +87,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant], rates: "SwitchingRates | None" = None):
         self.memory, self.rates = instance("memory", memory, MarkovChain, "a MarkovChain"), rates
-        self.models = _check_models("models of a plant", models, AbstractPlant)
+        self.models = _read_mode_models("models of a plant", models, AbstractPlant)
         start = self.models[0]
         if start.attitude:
             raise fail("models of a plant", "ones without an attitude", list(start.attitude))
@@ -174,7 +174,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractSensor]):
         self.memory = instance("memory", memory, MarkovChain, "a MarkovChain")
-        self.models = _check_models("models of a sensor", models, AbstractSensor)
+        self.models = _read_mode_models("models of a sensor", models, AbstractSensor)
         self.outputs, self.circular = self.models[0].outputs, self.models[0].circular
 
     @property  # type: ignore[misc]
@@ -265,7 +265,7 @@ def markov_plant(
             probabilities that are none; rates that are none, or without an input "dt" or an initial law.
     """
     # The models may differ in their law of motion alone.
-    plants = _check_models("models of a plant", models, AbstractPlant)
+    plants = _read_mode_models("models of a plant", models, AbstractPlant)
     for i, plant in enumerate(plants[1:], start=1):
         for what in ("states", "inputs", "circular", "limits"):
             if getattr(plant, what) != getattr(plants[0], what):
@@ -277,7 +277,7 @@ def markov_plant(
                 raise fail(f"law of x_0 of model {i}", "that of model 0, since the state starts before the first mode",
                            f"another {what.replace('_', ' ')}")  # fmt: skip
     if rates is None:
-        return ModalPlant(_read_chain(transition, initial, name, modes, len(plants)), plants)
+        return ModalPlant(_read_mode_chain(transition, initial, name, modes, len(plants)), plants)
     # With rates, it is these that move the mode, by the time between rows. The chain only holds the number of modes and
     # the initial law: it never switches by itself, so its transition is the identity.
     if initial is None:  # a law is asked for, since the identity has no stationary one of its own
@@ -288,7 +288,7 @@ def markov_plant(
     if TIME_STEP not in plants[0].inputs:
         raise fail("rates of the modes", f"plants with the input {TIME_STEP!r}", list(plants[0].inputs))
     moving = SwitchingRates(rates)
-    return ModalPlant(_read_chain(np.eye(len(moving.growth)), initial, name, None, len(plants)), plants, moving)
+    return ModalPlant(_read_mode_chain(np.eye(len(moving.growth)), initial, name, None, len(plants)), plants, moving)
 
 
 def markov_sensor(
@@ -315,7 +315,7 @@ def markov_sensor(
         ValueError: fewer than two models, models of other outputs or angles than the first, or that depend on inputs,
             probabilities that are none.
     """
-    sensors = _check_models("models of a sensor", models, AbstractSensor)
+    sensors = _read_mode_models("models of a sensor", models, AbstractSensor)
     for sensor in sensors:
         sensor.refuse_inputs("a sensor with modes")
     for i, sensor in enumerate(sensors[1:], start=1):
@@ -323,7 +323,7 @@ def markov_sensor(
             if getattr(sensor, what) != getattr(sensors[0], what):
                 raise fail(f"{what} of model {i}", f"{list(getattr(sensors[0], what))}, as those of model 0",
                            list(getattr(sensor, what)))  # fmt: skip
-    return ModalSensor(_read_chain(transition, initial, name, modes, len(sensors)), sensors)
+    return ModalSensor(_read_mode_chain(transition, initial, name, modes, len(sensors)), sensors)
 
 
 def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
@@ -337,12 +337,12 @@ def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax
     return jnp.kron(by_rates, jnp.eye(len(chain) // len(by_rates))) @ chain
 
 
-def models_of(model: Any) -> tuple[Any, ...]:
+def list_mode_models(model: Any) -> tuple[Any, ...]:
     """Return the models of a plant's or sensor's modes, itself alone where it has none."""
     return model.models if isinstance(model, ModalPlant | ModalSensor) else (model,)
 
 
-def _check_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
+def _read_mode_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
     """Return the models of a chain's modes, each of one law at each step."""
     checked = tuple(items(name, models, "one model for each mode"))
     if len(checked) < 2:
@@ -354,7 +354,7 @@ def _check_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
     return checked
 
 
-def _read_chain(
+def _read_mode_chain(
     transition: "Transition | None",
     initial: ArrayLike | None,
     name: str | None,

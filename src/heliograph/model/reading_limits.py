@@ -7,9 +7,9 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
-from heliograph.model.checks.refusal_reasons import Reason, number_of
+from heliograph.model.checks.refusal_reasons import Reason, number_of_reason
 from heliograph.model.limit_arguments import read_intervals, read_numbers
-from heliograph.model.repeated_readings import Repeats, StuckLike, count_repeats, stuck_counts
+from heliograph.model.repeated_readings import Repeats, StuckLike, count_repeats, find_stuck_counts
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
@@ -21,7 +21,7 @@ SINGLE = float(np.finfo(np.float32).eps) / 2  # of a number in single precision,
 
 FIRST = Repeats()  # before the first reading
 
-LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | Limits | None")
+LimitsLike = TypeAliasType("LimitsLike", "ArrayLike | Sequence[Sequence[float | None]] | ReadingLimits | None")
 
 
 def make_limits(
@@ -31,19 +31,21 @@ def make_limits(
     stuck: StuckLike = None,
     sensor: AnySensor | None = None,
     channel: Channel | None = None,
-) -> "Limits | None":
+) -> "ReadingLimits | None":
     """Return the limits of so many received numbers; those of another node as they are; None where there are none.
 
     `stuck` of True is by the noise and resolution of the sensor, behind the channel.
     """
-    codes, counts = read_numbers("invalid values", invalid), stuck_counts(received, stuck, sensor, channel)
-    if isinstance(limits, Limits):
+    codes, counts = read_numbers("invalid values", invalid), find_stuck_counts(received, stuck, sensor, channel)
+    if isinstance(limits, ReadingLimits):
         if len(limits.low) != received or codes.size or counts is not None:
             more = " and further codes" * bool(codes.size) + " and stuck=" * (counts is not None)
             got = f"those of {len(limits.low)}{more}"
             raise fail("limits of another node", f"those of {received} received numbers, codes and stuck included", got)
         return limits
-    return None if limits is None and codes.size == 0 and counts is None else Limits(received, limits, invalid, counts)
+    if limits is None and codes.size == 0 and counts is None:
+        return None
+    return ReadingLimits(received, limits, invalid, counts)
 
 
 class ScreenedReadings(NamedTuple):
@@ -61,10 +63,10 @@ class ScreenedReadings(NamedTuple):
 
     def by(self, reason: Reason) -> Bool[np.ndarray, "time m"]:
         """Return True for each that is refused for this reason (time, m)."""
-        return np.asarray(self.refused == number_of(reason))
+        return np.asarray(self.refused == number_of_reason(reason))
 
 
-class Limits(Module):
+class ReadingLimits(Module):
     """Received numbers that count as missing: below `low` or above `high`, equal to a code, or repeated for too long.
 
     A number is equal to a code up to the rounding of a product, since sensors send whole numbers that are scaled, or if
@@ -115,7 +117,7 @@ class Limits(Module):
             return ScreenedReadings(values, refused, before)
         counts, repeats = count_repeats(values, before)
         stuck = counts >= self.stuck
-        refused = np.where(stuck, number_of("stuck"), refused)
+        refused = np.where(stuck, number_of_reason("stuck"), refused)
         return ScreenedReadings(np.where(stuck, np.nan, values), refused, repeats)
 
     def judge_values(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
@@ -125,7 +127,9 @@ class Limits(Module):
         is missing already.
         """
         beyond = (z < self.low) | (z > self.high)
-        return np.where(is_code(z, self.invalid), number_of("code"), np.where(beyond, number_of("limits"), 0))
+        return np.where(
+            equals_code(z, self.invalid), number_of_reason("code"), np.where(beyond, number_of_reason("limits"), 0)
+        )
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that by itself counts as missing; NaN is not one of them."""
@@ -138,9 +142,9 @@ class Limits(Module):
         """
         said = []
         for i in np.flatnonzero(refused).tolist():
-            if refused[i] == number_of("code"):
+            if refused[i] == number_of_reason("code"):
                 reason = "is a code"
-            elif refused[i] == number_of("limits"):
+            elif refused[i] == number_of_reason("limits"):
                 reason = f"is outside {self.low[i]:g} to {self.high[i]:g}"
             else:
                 assert self.stuck is not None
@@ -149,7 +153,7 @@ class Limits(Module):
         return ", ".join(said)
 
 
-def is_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
+def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
     """Return whether each number is a code: equal up to the rounding of a product, or as single precision stores it.
 
     A code is a number that stands for no reading, such as -999.

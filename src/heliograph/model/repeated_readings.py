@@ -122,7 +122,7 @@ def _bound_in_step(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) ->
         return np.asarray(np.sum(np.exp(log_share) * scipy.special.erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
 
 
-def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
+def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
     """Return the least n of which a run of n equal readings begins at a reading with probability at most `seldom`.
 
     Noise is independent from reading to reading, so that a run of n has probability at most p^(n - 1).
@@ -136,7 +136,7 @@ def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -
     return np.asarray(np.maximum(n, LEAST))
 
 
-def stuck_counts(
+def find_stuck_counts(
     received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None
 ) -> Float[np.ndarray, " received"] | None:
     """Return of each received number how many equal readings in a row mean that its sensor is stuck.
@@ -185,7 +185,7 @@ def _count_by_law(received: int, sensor: AnySensor | None, channel: Channel | No
     for link in unstack(channel):
         if received != len(outputs) or not delivers_as_sent(link, outputs):
             raise fail("stuck", "a link that delivers readings as they are, or a number of equal readings", "True")
-    counts = np.max([longest_by_chance(bound_equal_readings(step.noise)) for step in steps], axis=0)
+    counts = np.max([longest_run_by_chance(bound_equal_readings(step.noise)) for step in steps], axis=0)
     if np.any(counts > MOST):
         longest = ceil(np.max(counts))
         raise fail("stuck", f"noise that ends a run of equal readings before {MOST:,}", f"{longest:,}")

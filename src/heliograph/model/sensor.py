@@ -10,16 +10,16 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.input_dependent_sensor import (
-    GivenInputs,
+    MeasureUnderInputs,
     NoiseOfInputs,
-    count_rows,
-    name_inputs,
+    count_matrix_rows,
     read_function_of_state_alone,
+    read_input_names,
     read_noise_of_inputs,
     require_constant,
 )
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
+from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, MatrixOfInputs, NoiseFunction
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
@@ -144,12 +144,12 @@ class Sensor(AbstractSensor):
         inputs: "Names" = (),
     ):
         # A function of (x, u), with a noise that may depend on u too.
-        self.inputs = name_inputs(inputs)
+        self.inputs = read_input_names(inputs)
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
             self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_to(self.noise, resolution, self.circular)
+            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
             return
         # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
         self.function, law = read_function_of_state_alone(measure), require_constant("sensor noise", noise)
@@ -163,7 +163,7 @@ class Sensor(AbstractSensor):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
         self.circular = read_angles("circular outputs", circular, self.outputs)
-        self.noise = _round_to(self.noise, resolution, self.circular)
+        self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return h(x); raise ValueError if the sensor depends on inputs."""
@@ -175,7 +175,7 @@ class Sensor(AbstractSensor):
         if not self.inputs:
             return self
         noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
-        return Sensor(GivenInputs(self.function, u), noise, self.outputs, self.circular)
+        return Sensor(MeasureUnderInputs(self.function, u), noise, self.outputs, self.circular)
 
 
 class LinearSensor(AbstractSensor):
@@ -192,7 +192,7 @@ class LinearSensor(AbstractSensor):
             none, functions of inputs without names.
     """
 
-    matrix: Float[jax.Array | np.ndarray, "m n"]  # or OfInputs, which refuses to be taken for an array
+    matrix: Float[jax.Array | np.ndarray, "m n"]  # or MatrixOfInputs, which refuses to be taken for an array
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
@@ -205,20 +205,20 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
-        self.inputs = name_inputs(inputs)
+        self.inputs = read_input_names(inputs)
         if self.inputs:
-            count = count_rows(matrix, self.inputs)  # C has a row for each output
+            count = count_matrix_rows(matrix, self.inputs)  # C has a row for each output
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, count, self.inputs)
-            C: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
+            C: Any = MatrixOfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = C if callable(matrix) else array("sensor matrix", C, ("outputs", "states"))
             self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_to(self.noise, resolution, self.circular)
+            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
             return
         self.matrix = array("sensor matrix", require_constant("sensor matrix", matrix), ("outputs", "states"))
         self.noise = as_noise("sensor noise", require_constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = read_angles("circular outputs", circular, self.outputs)
-        self.noise = _round_to(self.noise, resolution, self.circular)
+        self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return C x."""
@@ -230,7 +230,9 @@ class LinearSensor(AbstractSensor):
             return self
         matrix: Any = self.matrix
         noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
-        return LinearSensor(matrix(u) if isinstance(matrix, OfInputs) else matrix, noise, self.outputs, self.circular)
+        return LinearSensor(
+            matrix(u) if isinstance(matrix, MatrixOfInputs) else matrix, noise, self.outputs, self.circular
+        )
 
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the matrix is for states of this length: to trace the function would take long."""
@@ -240,7 +242,9 @@ class LinearSensor(AbstractSensor):
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
 
 
-def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequence[str]) -> AbstractNoise:
+def _round_noise_to_resolution(
+    noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequence[str]
+) -> AbstractNoise:
     """Return the noise of a sensor that rounds to multiples of its resolution; the noise itself without one."""
     if resolution is None:
         return noise

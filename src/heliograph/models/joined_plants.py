@@ -9,14 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.diffuse_start import DiffuseStart, UnknownStart
-from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of, split_inputs
+from heliograph.model.plant import (
+    AbstractPlant,
+    JointNoise,
+    LinearPlant,
+    MatrixOfInputs,
+    Plant,
+    matrix_under_inputs,
+    split_inputs,
+)
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import block_diagonal, library
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
 
 
-class SideBySide(Module):
+class TransitionSideBySide(Module):
     """Transition of several plants, each with its own part of the state and its own inputs.
 
     Args:
@@ -36,7 +44,7 @@ class SideBySide(Module):
         return jnp.concatenate(parts)
 
 
-class MatrixSideBySide(SideBySide):
+class MatrixSideBySide(TransitionSideBySide):
     """The block-diagonal matrix of linear plants."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
@@ -46,14 +54,14 @@ class MatrixSideBySide(SideBySide):
         return jnp.asarray(block_diagonal([jnp.asarray(plant.transition_matrix(own)) for plant, own in pairs]))
 
 
-class InputsSideBySide(SideBySide):
+class InputsSideBySide(TransitionSideBySide):
     """The input matrices of linear plants, one above the other."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs)."""
         rows, plants = [], list[Any](self.plants)  # linear ones
         for plant, own, at in zip(plants, split_inputs(u, self.places), self.places, strict=True):
-            matrix = jnp.asarray(matrix_of(plant.input_matrix, own))
+            matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own))
             rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(at, int)].set(matrix))
         return jnp.concatenate(rows)
 
@@ -92,7 +100,7 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
     attitude = [name for plant in parts for name in plant.attitude]
     limits = tuple(pair for plant in parts for pair in plant.limits)
     if not all(isinstance(plant, LinearPlant) for plant in parts):
-        move = SideBySide(tuple(parts), places)
+        move = TransitionSideBySide(tuple(parts), places)
         return Plant(move, noise, center, start, states, inputs, circular=circular, attitude=attitude, limits=limits)
     matrix, input_matrix = _join_matrices(parts, places, len(inputs))
     return LinearPlant(matrix, noise, center, start, input_matrix, states, inputs, circular=circular, limits=limits)
@@ -124,7 +132,7 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
 
 def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
     """Return A and B of linear plants side by side: constants, or functions of the inputs where some part is one."""
-    if any(isinstance(value, OfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
+    if any(isinstance(value, MatrixOfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
         plants = tuple(parts)
         return MatrixSideBySide(plants, places), InputsSideBySide(plants, places)
     pick = np.eye(count)

@@ -82,20 +82,20 @@ class Structural(Module):
             )
         u = None if inputs is None else array("inputs", inputs, ("steps", len(names)))
         found: dict[str, Any] = {}
-        for part, at in zip(self.parts, _places_of_states(self.parts), strict=True):
+        for part, at in zip(self.parts, _find_state_places(self.parts), strict=True):
             every = np.zeros((*(() if u is None else (len(u),)), len(self.plant.states)))
-            every[..., at] = part.loading if u is None else _weights_under_inputs(part, names).rows(u)
+            every[..., at] = part.loading if u is None else _make_component_weights(part, names).rows(u)
             found[part.name] = every
         return found
 
 
-def _places_of_states(parts: Sequence[Component]) -> list[slice]:
+def _find_state_places(parts: Sequence[Component]) -> list[slice]:
     """Return the places of each component's states among all."""
     ends = np.cumsum([0, *(len(part.plant.states) for part in parts)]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
-def _weights_under_inputs(part: Component, names: Sequence[str]) -> SumOfComponents:
+def _make_component_weights(part: Component, names: Sequence[str]) -> SumOfComponents:
     """Return the weights of a component's states under inputs of these names."""
     places = tuple(list(names).index(name) for name in part.inputs) if part.inputs else (None,) * len(part.loading)
     return SumOfComponents(part.loading, places)
@@ -129,6 +129,6 @@ def structural(components: "Sequence[Component]", noise: NoiseLike = 0.0, output
     outputs = [output] if isinstance(output, str) else output
     weights = library(*(part.loading for part in parts)).concatenate([part.loading for part in parts])
     inputs = list(dict.fromkeys(name for part in parts for name in part.inputs))
-    places = tuple(at for part in parts for at in _weights_under_inputs(part, inputs).places)
+    places = tuple(at for part in parts for at in _make_component_weights(part, inputs).places)
     matrix: Any = SumOfComponents(weights, places) if inputs else weights[None]
     return Structural(plant, LinearSensor(matrix, noise, outputs, inputs=inputs), tuple(parts))

@@ -70,7 +70,7 @@ def level(
     q, mean, start = (
         scalar("variance of the level", variance, 0.0),
         scalar("initial mean", initial_mean),
-        _read_start(initial_variance),
+        _read_initial_variance(initial_variance),
     )
     xp = library(mean)
     return Component(name, LinearPlant([[1.0]], q, xp.reshape(mean, (1,)), start, states=[name]), [1.0])
@@ -110,7 +110,7 @@ def trend(
         matrix=[[1.0, 1.0], [0.0, 1.0]],
         noise=_make_diagonal(variances),
         initial_mean=array("initial mean", initial_mean, (2,)),
-        initial_covariance=_read_start(initial_variance),
+        initial_covariance=_read_initial_variance(initial_variance),
         states=[f"{prefix}level", f"{prefix}slope"],
     )
     return Component(named, plant, loading=[1.0, 0.0])
@@ -138,7 +138,7 @@ def seasonal(
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 2.3.4.
     """
     n = check_count("period", period, 2) - 1
-    q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
+    q, start = scalar("variance of the season", variance, 0.0), _read_initial_variance(initial_variance)
     matrix = np.eye(n, k=-1)
     matrix[0] = -1.0
     noise = _make_diagonal([q] + [0.0] * (n - 1))
@@ -178,7 +178,7 @@ def trigonometric_seasonal(
     if not 1 <= count <= most:
         raise fail("harmonics", f"from 1 to {most}, which differ at whole steps", count)
     # A block, two states (of which the first is seen) and two weights for each wave.
-    q, start = scalar("variance of the season", variance, 0.0), _read_start(initial_variance)
+    q, start = scalar("variance of the season", variance, 0.0), _read_initial_variance(initial_variance)
     named, blocks, states, loading = text("name of a component", name), [], [], []
     for j in range(1, count + 1):
         alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0: one state
@@ -282,7 +282,7 @@ def regression(
     if not inputs:
         raise fail("regressors", "at least one name", "none")
     n = len(inputs)
-    q, start = scalar("variance of the coefficients", variance, 0.0), _read_start(initial_variance)
+    q, start = scalar("variance of the coefficients", variance, 0.0), _read_initial_variance(initial_variance)
     states = [f"{regressor}_coefficient" for regressor in inputs]
     plant = LinearPlant(np.eye(n), q, np.zeros(n), start, np.zeros((n, n)), states, inputs)
     return Component(name, plant, np.ones(n), inputs)
@@ -319,7 +319,7 @@ def stationary_covariance(matrix: Any, noise: Any) -> Any:
     return (found + found.T) / 2
 
 
-def _read_start(variance: "ArrayLike | DiffuseStart") -> Any:
+def _read_initial_variance(variance: "ArrayLike | DiffuseStart") -> Any:
     """Return the variance of states before the first step, checked; or `hg.diffuse`."""
     return variance if isinstance(variance, DiffuseStart) else scalar("initial variance", variance, 0.0)
 

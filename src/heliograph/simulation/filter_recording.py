@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.checks.refusal_reasons import number_of
+from heliograph.model.checks.refusal_reasons import number_of_reason
 from heliograph.model.checks.row_times import find_common_dates, warn_of_unequal_steps
-from heliograph.model.forecast_origin import Origin, find_usual_months, find_usual_spacing, last_input
+from heliograph.model.forecast_origin import Origin, find_median_spacing, find_months_between_rows, last_input
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_columns, fail, instance, rank, table
 from heliograph.numerics.float64 import refuse_forked_process
@@ -131,7 +131,7 @@ def run(
         record = replace(record, units=record.units | {"time": unit})
     _warn_of_record(network, record, state)
     # Where the rows end, for forecasts and later rows. Rows without times are all as far apart as the first two.
-    origin = _make_origin(network, record, state, u, find_usual_spacing(clock if times is not None else clock[:2]))
+    origin = _make_origin(network, record, state, u, find_median_spacing(clock if times is not None else clock[:2]))
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
 
@@ -194,7 +194,7 @@ def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray,
         time=record.time[-1],
         spacing=spacing,
         estimates=last_estimates,
-        months=find_usual_months(record.time),
+        months=find_months_between_rows(record.time),
     )
 
 
@@ -272,7 +272,7 @@ def _filter_plausible(
                 # Out of a copy of the measurements, since they are the caller's.
                 rows = list(reasons_by_row)
                 z[name] = z[name].copy()
-                left_out[name][rows] += ~np.isnan(z[name][rows]) * np.int8(number_of("implausible"))
+                left_out[name][rows] += ~np.isnan(z[name][rows]) * np.int8(number_of_reason("implausible"))
                 z[name][rows] = np.nan
             again = filter_rows(task, group_measurements(), judged=False)
             outputs = filter_rows(task, group_measurements(), judged=True) if any_implausible(again) else again

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import INPUT, Judgement
-from heliograph.model.checks.non_finite_results import find_function_fault
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
 from heliograph.model.over_time import first
 from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Float, PyTree
@@ -229,7 +229,7 @@ class _FaultFinder:
         else:
             at = self.network.places[node, name]
             before = jax.tree.map(lambda leaf: leaf[row - 1, at.filter, at.node], self.outputs["estimates"][at.kind])
-        fault = find_function_fault(filter, before, self.u[row], row)
+        fault = describe_non_finite_function(filter, before, self.u[row], row)
         return f"; {fault}" if fault else ""
 
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of
-from heliograph.model.reading_limits import Limits
+from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of_reason
+from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.repeated_readings import Repeats
 from heliograph.model.timeouts import find_long_silences
 from heliograph.numerics.types import Float, Int
@@ -73,7 +73,7 @@ def screen_recording(
 
 def _describe_refused(
     reason: Reason,
-    limits: Limits,
+    limits: ReadingLimits,
     z: Float[np.ndarray, "steps m"],
     refused: Int[np.ndarray, "steps m"],
     node: Node | ReceivingNode,
@@ -87,7 +87,7 @@ def _describe_refused(
         refused: number of the reason of each reading, 0 where it is kept.
         node: the node.
     """
-    here = np.where(refused == number_of(reason), refused, 0)
+    here = np.where(refused == number_of_reason(reason), refused, 0)
     row, came = int(np.argmax(here.any(axis=1))), int(np.count_nonzero(~np.isnan(z)))
     why = limits.describe_missing(z[row], here[row], node.received_names)
     return f"{np.count_nonzero(here)} of {came} values count as not arrived, by {reason}; row {row + 1}: {why}"

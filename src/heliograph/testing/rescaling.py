@@ -27,7 +27,7 @@ from heliograph.filters.modes.uncertain_chain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.over_time import OverTime, at_each_step, first, stacked
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, OfInputs, Plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
@@ -202,11 +202,11 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 
 
 def _rescale_matrix(
-    matrix: OfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
+    matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
     """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
     factor = out[:, None] / into
-    if isinstance(matrix, OfInputs):
+    if isinstance(matrix, MatrixOfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
     return np.asarray(out[:, None] * matrix / into)
 

@@ -30,10 +30,10 @@ from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.diffuse_start import UnknownStart
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, read_first_plant
 from heliograph.model.premises.premise import believes
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
@@ -219,10 +219,10 @@ def open_loop_filter(
 
     Source: the prediction step of any of the filters, alone.
     """
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
-    claim = lower_by_noise("exact" if linear else "nominal", plant)
+    claim = lower_claim_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

@@ -27,12 +27,12 @@ from heliograph.filters.wrappers.reported_law import accept_told_numbers
 from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
-from heliograph.model.markov_jump_models import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes, on_premise
+from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
@@ -218,7 +218,7 @@ def linear_filter(
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
         return wrappers.build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
-    for moves, senses in product(models_of(first(plant)), models_of(first(sensor))):
+    for moves, senses in product(list_mode_models(first(plant)), list_mode_models(first(sensor))):
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
     # Memory: the modes are estimated jointly with the state. A sensor that rounds may lower the claim.
@@ -228,7 +228,7 @@ def linear_filter(
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
+        return replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
@@ -241,7 +241,7 @@ def linear_filter(
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         **make_sizes(
-            lower_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
+            lower_claim_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
@@ -338,4 +338,4 @@ def as_current_filter(
 
 def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:
     """Return the same filter with claim nominal: it ignores delay or memory that the link has."""
-    return on_premise(replace(ignoring, claim="nominal"), ignoring.premise)
+    return with_premise(replace(ignoring, claim="nominal"), ignoring.premise)

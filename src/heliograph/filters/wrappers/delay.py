@@ -31,7 +31,7 @@ from heliograph.model.channel import Channel, check_link, delayed
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premises.premise import believes, on_premise
+from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
@@ -274,8 +274,10 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
-        return on_premise(late, premise)
-    return on_premise(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
+        return with_premise(late, premise)
+    return with_premise(
+        late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel))
+    )
 
 
 class KnownDelayFilter(AbstractWrapper):

@@ -16,7 +16,7 @@ from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Innovation, lower_by_noise
+from heliograph.model.estimate import Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at, first, stacked
 from heliograph.model.plant import AnyPlant
@@ -176,5 +176,5 @@ def fed_back_filter(
     refuse_angles("filter that is fed back", plant, sensor)
     described = stacked(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
-    claim = lower_by_noise("exact" if exact else "nominal", plant, sensor, channel)
+    claim = lower_claim_by_noise("exact" if exact else "nominal", plant, sensor, channel)
     return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, OfInputs, Plant, matrix_of
+from heliograph.model.plant import AbstractPlant, JointNoise, LinearPlant, MatrixOfInputs, Plant, matrix_under_inputs
 from heliograph.model.sensor import AbstractSensor, LinearSensor, Sensor, check_sensor
 from heliograph.numerics.check import TINY, array, fail, instance, rank, scalar
 from heliograph.numerics.module import Module
@@ -77,7 +77,7 @@ def with_bias(
         if by_output:
             names = [rename(name, f"{name}_bias") for name in sensor.outputs]
         bias = _make_gauss_markov(plant, names, bias, time, dt)
-    return append_driving_plant(plant, bias, E), _append_to_sensor(sensor, D, n)
+    return append_driving_plant(plant, bias, E), _add_bias_to_sensor(sensor, D, n)
 
 
 def _make_gauss_markov(
@@ -94,7 +94,7 @@ def _make_gauss_markov(
     """
     count, what = len(names), "deviation of a bias"
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
-    rates = [_compute_rate(x) for x in _broadcast_to_biases("time of a bias", time, count)]
+    rates = [_invert_time_constant(x) for x in _broadcast_to_biases("time of a bias", time, count)]
     # Deviation and 1 / T of each bias, as arrays (biases,).
     sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
     xp = library(sd, rate)
@@ -177,14 +177,14 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
         move = DrivenTransition(plant, bias, coupling, places)
         return Plant(move, noise, center, start, states, plant.inputs, circular, plant.attitude, limits)
     inputs_of_bias = np.eye(len(plant.inputs))[list(places)]  # takes those of b out of all inputs
-    matrix, input_matrix = _stack_blocks(plant, bias, coupling, inputs_of_bias)
+    matrix, input_matrix = _make_driven_matrices(plant, bias, coupling, inputs_of_bias)
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 
 
-def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
+def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
     """Return [[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
     below = np.zeros((len(bias.states), len(plant.states)))
-    if not any(isinstance(value, OfInputs) for model in (plant, bias) for value in vars(model).values()):
+    if not any(isinstance(value, MatrixOfInputs) for model in (plant, bias) for value in vars(model).values()):
         xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
         matrix = xp.block([[plant.matrix, coupling], [below, bias.matrix]])
         return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
@@ -196,7 +196,9 @@ def _stack_blocks(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, p
 
     def drive(u: jax.Array) -> jax.Array:
         """Return [B; B_b] under the inputs u."""
-        return jnp.concatenate([matrix_of(plant.input_matrix, u), matrix_of(bias.input_matrix, pick @ u) @ pick])
+        return jnp.concatenate(
+            [matrix_under_inputs(plant.input_matrix, u), matrix_under_inputs(bias.input_matrix, pick @ u) @ pick]
+        )
 
     return move, drive
 
@@ -213,7 +215,7 @@ class BiasedMeasurement(Module):
         return self.sensor.measure(x[: self.states]) + jnp.asarray(self.loading) @ x[self.states :]
 
 
-def _append_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
+def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
     """Return the sensor y = h(x) + D b + v of [x; b], D the loading and `states` the length of x."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(BiasedMeasurement(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
@@ -230,7 +232,7 @@ def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     return values
 
 
-def _compute_rate(time: Any) -> Any:
+def _invert_time_constant(time: Any) -> Any:
     """Return 1 / T, 0 of an infinite one."""
     constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
     return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)

@@ -86,7 +86,7 @@ def with_clocks(
     instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
     sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
     n = len(plant.states)
-    step = _read_step(plant, dt)
+    step = _read_step_length(plant, dt)
     if set(clocks) - set(sensors) or not clocks:
         raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
     for name, sensor in sensors.items():
@@ -97,13 +97,13 @@ def with_clocks(
     total = n + 2 * len(clocks)
     offsets = {name: n + 2 * i for i, name in enumerate(clocks)}
     # The clocks are a plant beside that of x, which they do not drive: a coupling of zeros.
-    larger = append_driving_plant(plant, _make_clocks(clocks, step), np.zeros((n, 2 * len(clocks))))
+    larger = append_driving_plant(plant, _make_clock_plant(clocks, step), np.zeros((n, 2 * len(clocks))))
     return larger, {
-        name: _enlarge_sensor(sensor, moving, n, total, offsets.get(name)) for name, sensor in sensors.items()
+        name: _make_stamped_sensor(sensor, moving, n, total, offsets.get(name)) for name, sensor in sensors.items()
     }
 
 
-def _read_step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
+def _read_step_length(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
     """Return the time of a step, or the name of the plant's input that says it."""
     if not isinstance(dt, str):
         return scalar("time of a step", dt, 0.0)
@@ -112,7 +112,7 @@ def _read_step(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
     return plant.inputs[plant.inputs.index(dt)]
 
 
-def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
+def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     """Return the plant of all clocks: offset o+ = o + dt d and drift d+ = d + w of each, independent at the start.
 
     Steps of one length: w has the variance `wander`. Lengths that an input says: d gains white noise within the step,
@@ -156,7 +156,7 @@ def _make_clocks(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant:
     return LinearPlant(matrix_over, noise_over, mean, start, states=states, inputs=[dt])
 
 
-def _enlarge_sensor(
+def _make_stamped_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
 ) -> LinearSensor | StampedSensor:
     """Return the sensor for a state of `total` components, of which the first `states` are those that it measures.

@@ -65,7 +65,7 @@ def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> LinearSensor | Sensor
     return LinearSensor(library(linear).concatenate(linear), noise, outputs, circular)
 
 
-class SensorsUnderInputs(Module):
+class InputDependentSensors(Module):
     """Sensors side by side of which some depend on inputs, with the places of their inputs among all.
 
     Args:
@@ -81,7 +81,7 @@ class SensorsUnderInputs(Module):
         return [part.given(own) for part, own in zip(self.parts, split_inputs(u, self.places), strict=True)]
 
 
-class JointMatrix(SensorsUnderInputs):
+class JointMatrix(InputDependentSensors):
     """Matrices of linear sensors, one above the other."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
@@ -89,7 +89,7 @@ class JointMatrix(SensorsUnderInputs):
         return jnp.concatenate([jnp.asarray(sensor.matrix) for sensor in self.given(u)])
 
 
-class JointMeasure(SensorsUnderInputs):
+class JointMeasure(InputDependentSensors):
     """Measurements of sensors, one above the other."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -97,7 +97,7 @@ class JointMeasure(SensorsUnderInputs):
         return jnp.concatenate([sensor.measure(x) for sensor in self.given(u)])
 
 
-class JointNoiseOfSensors(SensorsUnderInputs):
+class JointSensorNoise(InputDependentSensors):
     """Covariance of independent noises of sensors."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
@@ -112,7 +112,7 @@ def _join_sensors_of_inputs(
     inputs = list(dict.fromkeys(name for sensor in parts for name in sensor.inputs))
     every = parts, tuple(tuple(inputs.index(name) for name in sensor.inputs) for sensor in parts)
     noises = [sensor.noise for sensor in parts]
-    noise: Any = JointNoiseOfSensors(*every)
+    noise: Any = JointSensorNoise(*every)
     if all(isinstance(law, AbstractNoise) for law in noises):
         noise = Independent(noises)
     elif not all(isinstance(law, Gaussian | NoiseOfInputs) for law in noises):

@@ -34,13 +34,13 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     """
     check_linear("plant and sensor behind a random delay", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
-    moved: AnyPlant = at_each_step(partial(_append_line, past=first(channel).past), plant, sensor)
+    moved: AnyPlant = at_each_step(partial(_append_delay_line, past=first(channel).past), plant, sensor)
     n, total = len(first(plant).states), len(first(moved).states)
     everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
     return moved, everything, place_on_delay_line(channel)
 
 
-def _append_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
+def _append_delay_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     """Return the plant of (x, y_k, ..., y_{k-past}): x+ = A x + B u + w, y+ = C x+ + v, and older outputs move on.
 
     Args:

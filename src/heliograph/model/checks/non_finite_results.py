@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.checks.plant_inputs import parts_in, plants_in
+from heliograph.model.checks.plant_inputs import yield_models_of_class, yield_plants
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant
@@ -14,7 +14,7 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.types import Float, PyTree
 
 
-def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inputs"], step: int) -> str:
+def describe_non_finite_function(filter: PyTree, before: Estimate, u: Float[np.ndarray, " inputs"], step: int) -> str:
     """Return in words which function of a filter's model returned no finite number, and for what; "" if none did.
 
     The functions are tried at the mean before the step and one deviation from it in each state, as filters do.
@@ -27,14 +27,14 @@ def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, "
     """
     given = f", u = {u.tolist()}" if len(u) else ""
     with jax.enable_x64(True):
-        for x in _iterate_trials(before):
+        for x in _yield_trial_states(before):
             states = [x]
-            for plant in (at(part, step) for part in plants_in(filter)):
-                if _plant_takes(plant, x, u):
+            for plant in (at(part, step) for part in yield_plants(filter)):
+                if _plant_fits(plant, x, u):
                     states.append(np.asarray(plant.transition(jnp.asarray(x), jnp.asarray(u))))
                     if not np.isfinite(states[-1]).all():
                         return f"transition(x, u) returned {states[-1].tolist()} for x = {x.tolist()}{given}"
-            for sensor in (at(part, step) for part in parts_in(filter, AbstractSensor)):
+            for sensor in (at(part, step) for part in yield_models_of_class(filter, AbstractSensor)):
                 for state in states:
                     y = _measure(sensor, state)
                     if not np.isfinite(y).all():
@@ -42,7 +42,7 @@ def find_function_fault(filter: PyTree, before: Estimate, u: Float[np.ndarray, "
     return ""
 
 
-def _iterate_trials(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
+def _yield_trial_states(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
     """Yield the mean, and the states one deviation from it."""
     mean = np.asarray(before.mean)
     variances = np.diag(np.asarray(before.covariance))
@@ -52,7 +52,7 @@ def _iterate_trials(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
             yield mean + sign * np.sqrt(variances[i]) * np.eye(len(mean))[i]
 
 
-def _plant_takes(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
+def _plant_fits(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
     """Return whether a plant has as many states and inputs."""
     return len(plant.states) == len(x) and len(plant.inputs) == len(u)
 

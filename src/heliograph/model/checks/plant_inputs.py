@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.input_dependent_sensor import NoiseOfInputs
-from heliograph.model.markov_jump_models import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import at, first, stacked
-from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, OfInputs, matrix_of
+from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, matrix_under_inputs
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
 from heliograph.numerics.float64 import compile_in_float64
@@ -27,7 +27,7 @@ ROWS = 4096  # of inputs for which functions are computed at once
 MOST_SHOWN = 100  # characters of a matrix
 LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more than they do
 
-MatrixOfInputs = Callable[[Any, jax.Array], jax.Array]  # of a plant or a sensor, and its inputs
+ModelMatrixFunction = Callable[[Any, jax.Array], jax.Array]  # of a plant or a sensor, and its inputs
 
 
 class TimeStepFault(NamedTuple):
@@ -104,31 +104,31 @@ def check_inputs(
     check_time_step(names, u)
     steps = np.arange(len(u)) + step if np.ndim(step) == 0 else np.asarray(step)
     known: set[int] = set()
-    for plant in plants_in(models):
+    for plant in yield_plants(models):
         if id(plant) not in known and first(plant).inputs == tuple(names):
-            _check_functions(plant, u, steps)
+            _check_functions_of_inputs(plant, u, steps)
         known.add(id(plant))
     for sensor, places in _sensors_of_inputs(models, names):
         if id(sensor) not in known:
-            _check_functions(sensor, u[:, places], steps)
+            _check_functions_of_inputs(sensor, u[:, places], steps)
         known.add(id(sensor))
 
 
 def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
     """Yield the sensors that depend on some of these inputs, and the places of those."""
-    for sensor in parts_in(models, AbstractSensor):
+    for sensor in yield_models_of_class(models, AbstractSensor):
         own = first(sensor).inputs
         if own and set(own) <= set(names):
             yield sensor, [list(names).index(name) for name in own]
 
 
-def plants_in(models: PyTree) -> Iterator[AnyPlant]:
+def yield_plants(models: PyTree) -> Iterator[AnyPlant]:
     """Yield the plants that a model object holds; of one with modes its laws of motion."""
-    for plant in parts_in(models, AbstractPlant):
-        yield from models_of(plant)
+    for plant in yield_models_of_class(models, AbstractPlant):
+        yield from list_mode_models(plant)
 
 
-def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
+def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
     """Yield what a model object holds of a class of models, constant or over time."""
 
     def is_part(part: object) -> bool:
@@ -138,19 +138,19 @@ def parts_in(models: PyTree, kind: type) -> Iterator[PyTree]:
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
 
 
-def _list_functions(model: AbstractPlant | AbstractSensor) -> dict[str, MatrixOfInputs]:
+def _list_functions_of_inputs(model: AbstractPlant | AbstractSensor) -> dict[str, ModelMatrixFunction]:
     """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
-    every: dict[str, MatrixOfInputs] = {}
+    every: dict[str, ModelMatrixFunction] = {}
     if isinstance(model, AbstractSensor):
-        if isinstance(model, LinearSensor) and isinstance(model.matrix, OfInputs):
+        if isinstance(model, LinearSensor) and isinstance(model.matrix, MatrixOfInputs):
             every["sensor matrix(u)"] = _sensor_matrix
         if isinstance(model.noise, NoiseOfInputs):
             every[SENSOR_NOISE] = _sensor_noise
         return every
     if isinstance(model, LinearPlant):
-        if isinstance(model.matrix, OfInputs):
+        if isinstance(model.matrix, MatrixOfInputs):
             every["plant matrix(u)"] = LinearPlant.transition_matrix
-        if isinstance(model.input_matrix, OfInputs):
+        if isinstance(model.input_matrix, MatrixOfInputs):
             every["input matrix(u)"] = _input_matrix
     if not isinstance(model.noise, AbstractNoise):
         every[NOISE] = AbstractPlant.noise_covariance
@@ -163,7 +163,7 @@ COVARIANCES = NOISE, SENSOR_NOISE
 
 def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
     """Return C(u) of a linear sensor."""
-    return matrix_of(sensor.matrix, u)
+    return matrix_under_inputs(sensor.matrix, u)
 
 
 def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
@@ -175,15 +175,17 @@ def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
 def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
     """Return B of a linear plant under the inputs u."""
     assert isinstance(plant, LinearPlant)
-    return matrix_of(plant.input_matrix, u)
+    return matrix_under_inputs(plant.input_matrix, u)
 
 
-def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray) -> None:
+def _check_functions_of_inputs(
+    plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray
+) -> None:
     """Raise ValueError that names the row whose inputs u give a matrix that is not finite, or no covariance."""
-    functions = _list_functions(first(plant))
-    parts = list(_evaluate_by_parts(plant, tuple(functions.values()), u, steps)) if functions else []
+    functions = _list_functions_of_inputs(first(plant))
+    parts = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
-        wrong = find_wrong_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
+        wrong = mask_invalid_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
             given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
@@ -192,9 +194,9 @@ def _check_functions(plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps in
             raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
 
 
-def _evaluate_by_parts(
+def _evaluate_in_blocks_of_steps(
     plant: AnyPlant | AnySensor,
-    functions: tuple[MatrixOfInputs, ...],
+    functions: tuple[ModelMatrixFunction, ...],
     u: Float[np.ndarray, "steps inputs"],
     steps: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, ...]]:
@@ -205,7 +207,7 @@ def _evaluate_by_parts(
 
 @compile_in_float64
 def _evaluate_at_steps(
-    plant: AnyPlant | AnySensor, functions: tuple[MatrixOfInputs, ...], u: Array, steps: Array
+    plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
     """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
 
@@ -223,7 +225,7 @@ def _shorten(value: np.ndarray) -> str:
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 
 
-def find_wrong_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
+def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
     """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
     finite = np.isfinite(values).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], values, 0.0)
@@ -250,20 +252,20 @@ def do_inputs_spoil(
     spoilt = jnp.asarray(False)
     if TIME_STEP in names:
         spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)], precision or np.float64))
-    for varying in plants_in(model):
+    for varying in yield_plants(model):
         plant = at(varying, k)
         if not names or plant.inputs != tuple(names):
             continue
-        spoilt |= _is_spoilt(plant, u, precision)
+        spoilt |= _returns_invalid_value(plant, u, precision)
     for sensor, places in _sensors_of_inputs(model, names):
-        spoilt |= _is_spoilt(at(sensor, k), u[np.array(places)], precision)
+        spoilt |= _returns_invalid_value(at(sensor, k), u[np.array(places)], precision)
     return spoilt
 
 
-def _is_spoilt(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
+def _returns_invalid_value(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
     """Decide whether a function of a model's inputs returns what is none."""
     spoilt = jnp.asarray(False)
-    for name, function in _list_functions(model).items():
+    for name, function in _list_functions_of_inputs(model).items():
         value = function(model, u)
         sound = _is_covariance(value, precision) if name in COVARIANCES else jnp.all(jnp.isfinite(value))
         spoilt |= ~sound

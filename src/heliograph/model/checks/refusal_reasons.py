@@ -35,7 +35,7 @@ class RefusedError(InputError):
         self.reason: Reason = reason
 
 
-def number_of(reason: Reason) -> int:
+def number_of_reason(reason: Reason) -> int:
     """Return the number that stands for a reason in an array, from 1; 0 stands for a reading that is kept."""
     return 1 + REASONS.index(reason)
 
@@ -46,7 +46,7 @@ def count_by_reason(refused: Int[np.ndarray, "time m"]) -> dict[Reason, Int[np.n
     Args:
         refused: the number of the reason of each reading, 0 of one that is kept (time, m).
     """
-    counts = {reason: np.count_nonzero(refused == number_of(reason), axis=0) for reason in REASONS}
+    counts = {reason: np.count_nonzero(refused == number_of_reason(reason), axis=0) for reason in REASONS}
     return {reason: count for reason, count in counts.items() if count.any()}
 
 

@@ -17,7 +17,7 @@ CUTS = ((0.0, 1.0), (0.25, 0.75), (1.0, 0.0))  # of an interval of length one, i
 TOLERANCE = 1e-9  # relative: a few products lose 1e-15
 
 
-def find_part_by_steps(
+def find_indivisible_part(
     plant: AnyPlant | None,
     sensor: AnySensor | None = None,
     channel: Channel | None = None,
@@ -40,7 +40,7 @@ def find_part_by_steps(
     return "" if trigger is None else "a sender with a trigger"
 
 
-def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
+def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     """Explain how a plant's prediction over an interval differs from that over its parts; "" if it does not.
 
     f(f(x, s), t) = f(x, s + t), A(s + t) = A(t) A(s), Q(s + t) = A(t) Q(s) A(t)' + Q(t), with A the Jacobian of f. We
@@ -54,8 +54,8 @@ def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + spread):
-        whole = _integrate_parts(plant, dt, x, cuts.sum(axis=1, keepdims=True))
-        parts = _integrate_parts(plant, dt, x, cuts)
+        whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
+        parts = _predict_over_intervals(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):
             for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
                 gap = float(np.abs(at_once[i] - in_two[i]).max())
@@ -68,7 +68,7 @@ def explain_unevenness(plant: AbstractPlant, dt: int) -> str:
 
 
 @compile_on_call
-def _integrate_parts(
+def _predict_over_intervals(
     plant: AbstractPlant, dt: int, x: Float[Array, " n"], intervals: Float[Array, "cut part"]
 ) -> tuple[Float[Array, "cut n"], Float[Array, "cut n n"], Float[Array, "cut n n"]]:
     """Return the mean, transition matrix and noise covariance after some intervals of time, passed one after another.

@@ -34,7 +34,7 @@ from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, Ce
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.report_link import ReportModel
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise, weakest
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise, weakest
 from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
@@ -209,7 +209,7 @@ def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shar
         return "nominal"
     _check_linear(rule, plant, nodes)
     known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
-    return lower_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
+    return lower_claim_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
 def has_data_dependent_gains(nodes: Parts) -> bool:

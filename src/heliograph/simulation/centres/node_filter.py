@@ -17,7 +17,7 @@ from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
@@ -167,7 +167,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         received=own + sum(_count_numbers(len(network.states), size) for size in of_neighbours),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
-    return on_premise(filter, find_premise(network, node))
+    return with_premise(filter, find_premise(network, node))
 
 
 def _build_row(network: Network, fusion: str, node: str) -> Mesh:

@@ -11,7 +11,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear import SEEN
 from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
-from heliograph.model.channel_side_information import separate_told
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
@@ -226,7 +226,7 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
 
 def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return a channel with typical values of the numbers that messages tell, since being told takes no memory."""
-    link, _, numbers = separate_told(channel)
+    link, _, numbers = separate_told_numbers(channel)
     return believe_typical(link) if numbers else channel
 
 

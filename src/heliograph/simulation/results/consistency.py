@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.model.plant import AnyPlant, manifold_among
+from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.model.sensor import AnySensor, angles_of_outputs
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
@@ -78,9 +78,7 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _normalise_square(
-        manifold_among(angles, x.shape[-1]).difference(x, m), _broadcast_to_steps(covariance, x), x
-    )
+    return _normalise_square(read_manifold(angles, x.shape[-1]).difference(x, m), _broadcast_to_steps(covariance, x), x)
 
 
 def nis(

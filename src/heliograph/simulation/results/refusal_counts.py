@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliograph.filters.innovation import Weighed
-from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of
+from heliograph.model.checks.refusal_reasons import Reason, count_by_reason, number_of_reason
 from heliograph.numerics.module import readable
 
 
@@ -44,7 +44,7 @@ def list_refusals(
     counted = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
     for node, filters in weighed.items():
         for filter, parts in filters.items():
-            gate = np.where(np.asarray(parts.weight) == 0, number_of("gate"), 0)
+            gate = np.where(np.asarray(parts.weight) == 0, number_of_reason("gate"), 0)
             counted += _count_refusals(node, filter, gate)
     return tuple(counted)
 
@@ -53,5 +53,5 @@ def _count_refusals(node: str, filter: str, refused: np.ndarray) -> Iterator[Ref
     """Yield, by component and reason, how many readings one table of reasons (time, received) has."""
     for reason, counts in count_by_reason(refused).items():
         for i in np.flatnonzero(counts).tolist():
-            row = int(np.argmax(refused[:, i] == number_of(reason)))
+            row = int(np.argmax(refused[:, i] == number_of_reason(reason)))
             yield Refusal(node, filter, i, reason, int(counts[i]), row)

@@ -8,7 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import stack
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.word_channel import reader_of, rewrite_in_bits
+from heliograph.model.words.word_channel import make_word_reader, rewrite_in_bits
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
@@ -88,7 +88,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
         trigger=None if triggers[0] is None else stack(triggers),
         encoder=None if encoders[0] is None else stack(encoders),
         informed_at=None if place is None else (place.kind, place.filter),
-        reader=None if encoders[0] is None else reader_of(first_node.channel),
+        reader=None if encoders[0] is None else make_word_reader(first_node.channel),
     )
 
 
