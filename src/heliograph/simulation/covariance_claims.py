@@ -28,7 +28,7 @@ from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
 UNSAID = "something that it does not say"
 
 
-class OtherBelief(NamedTuple):
+class MistakenBelief(NamedTuple):
     """What a filter of a network believes that is not so at its place.
 
     Args:
@@ -184,7 +184,7 @@ def find_common_premise(network: HasNodes) -> Premise:
     return join_premises([find_premise(network, name) for name in nodes]) if nodes else Premise(network.plant)
 
 
-def list_other_beliefs(network: HasNodes) -> Iterator[OtherBelief]:
+def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
     """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
 
     Args:
@@ -192,18 +192,18 @@ def list_other_beliefs(network: HasNodes) -> Iterator[OtherBelief]:
     """
     for name in network.names:
         if filters := network.nodes[name].filters:
-            yield from _collect_beliefs(name, find_premise(network, name), filters)
+            yield from _yield_mistaken_beliefs(name, find_premise(network, name), filters)
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     if central:
-        yield from _collect_beliefs(FUSED, find_common_premise(network), central)
+        yield from _yield_mistaken_beliefs(FUSED, find_common_premise(network), central)
 
 
-def _collect_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[OtherBelief]:
+def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[MistakenBelief]:
     """Yield the filters of a node that claim something and were made for another world than its `own`."""
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
         if filter.claim != "none" and says and (parts := list_mistaken_parts(own, filter)):
-            yield OtherBelief(node, label, parts, filter.kept.lowered)
+            yield MistakenBelief(node, label, parts, filter.kept.lowered)
 
 
 def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:

@@ -18,9 +18,9 @@ from heliograph.numerics.times.row_times import check_times
 from heliograph.numerics.types import ArrayLike, PyTree, units_in
 from heliograph.simulation.arguments import read_measurements, read_plant_inputs
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.description.angle_doubts import warn_beyond_a_turn, warn_wide_in_rows
+from heliograph.simulation.description.angle_doubts import doubt_angles_beyond_a_turn, doubt_wide_angles_in_rows
 from heliograph.simulation.description.doubtful_estimates import doubt_estimates
-from heliograph.simulation.description.filter_remarks import say_remarks
+from heliograph.simulation.description.filter_remarks import describe_remarks
 from heliograph.simulation.implausible_data import (
     FilterJudges,
     any_implausible,
@@ -32,14 +32,14 @@ from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
-from heliograph.simulation.rows.implausible_node import refuse_centrally
+from heliograph.simulation.rows.implausible_node import blame_nodes_for_implausible_rows
 from heliograph.simulation.scan_recording import (
     FilteringTask,
     RecordingStart,
+    continue_times,
     filter_rows,
     find_central_states_before_rows,
-    join_behind,
-    read_origin,
+    read_recording_start,
 )
 from heliograph.simulation.screened_recording import screen_recording
 from heliograph.simulation.smoothed import SmoothingPlan, add_truth, make_smoothed_record, select_smoothed_part
@@ -105,7 +105,7 @@ def run(
     z = {name: read_measurements(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds, judges=True)
-    before = None if after is None else read_origin(filters, after, smooths=smooth is not None)
+    before = None if after is None else read_recording_start(filters, after, smooths=smooth is not None)
     first = 0 if before is None else int(before.step)
     network.check_horizon(first + steps)
     u = read_plant_inputs(network, inputs, steps)
@@ -113,25 +113,29 @@ def run(
     true = None if truth is None else array("truth", truth, (steps, len(network.states)), missing=True)
     times = _find_times(measured, {"inputs": inputs, "truth": truth}, time, steps)
     clock = first + np.arange(steps, dtype=np.float64) if times is None else times
-    joined = join_behind(before, clock)
+    joined = continue_times(before, clock)
     warn_of_unequal_steps(network.inputs, None if times is None else joined)
     refuse_shared_dithers(network, z)
     # Readings that the nodes refuse count as not arrived.
     z, refused, said, repeats = screen_recording(network, z, u, {} if before is None else before.repeats)
-    _warn_of_each((*said, *warn_beyond_a_turn(network, z)))
+    _warn_of_each((*said, *doubt_angles_beyond_a_turn(network, z)))
     # Filters, on what is left without implausible data.
     begin = None if before is None else RecordingStart(before.state, np.asarray(first))
     with jax.enable_x64(True):
         arrivals = _collect_arrivals(filters, {} if reports is None else reports, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
-        outputs = _filter_plausible(network, z, refused, FilteringTask(filters, smoother, u, arrivals, begin))
+        outputs = _filter_without_implausible_data(
+            network, z, refused, FilteringTask(filters, smoother, u, arrivals, begin)
+        )
     state = outputs.pop("state")
     record = _make_record(network, smoothing, outputs, clock)
     if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
         record = replace(record, units=record.units | {"time": unit})
     _warn_of_record(network, record, state)
     # Where the rows end, for forecasts and later rows. Rows without times are all as far apart as the first two.
-    origin = _make_origin(network, record, state, u, find_median_spacing(clock if times is not None else clock[:2]))
+    origin = _make_forecast_origin(
+        network, record, state, u, find_median_spacing(clock if times is not None else clock[:2])
+    )
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
 
@@ -142,8 +146,8 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
     `state`: of all filters after the last row.
     """
     warn_of_no_numbers(record)
-    doubts = *warn_wide_in_rows(network, record), *doubt_estimates(network, record)
-    _warn_of_each((*doubts, *_describe_left_out(network, record), *say_remarks(network, state)))
+    doubts = *doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)
+    _warn_of_each((*doubts, *_describe_left_out(network, record), *describe_remarks(network, state)))
 
 
 def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:
@@ -170,7 +174,7 @@ def _count_rows(measurements: ArrayLike) -> int:
     return steps
 
 
-def _make_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
+def _make_forecast_origin(network: Network, record: Record, state: PyTree, u: np.ndarray, spacing: float) -> Origin:
     """Return where forecasts start, behind the last row.
 
     Args:
@@ -236,7 +240,7 @@ def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict
     return centre_arrivals | mesh_arrivals
 
 
-def _filter_plausible(
+def _filter_without_implausible_data(
     network: Network, z: dict[str, np.ndarray], left_out: dict[str, np.ndarray], task: FilteringTask
 ) -> PyTree:
     """Return the results of filtering a recording without implausible data, and warn of these.
@@ -304,6 +308,6 @@ def _find_refused_rows(
         states = find_central_states_before_rows(task, grouped)
         in_order = {name: z[name] for name in network.names}
         nodes = FilterJudges(network).without_own
-        refused |= refuse_centrally(filters.central, states, in_order, u, centrally, nodes)
+        refused |= blame_nodes_for_implausible_rows(filters.central, states, in_order, u, centrally, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}

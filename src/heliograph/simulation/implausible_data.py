@@ -175,7 +175,7 @@ def describe_doubts(
         u: inputs of the plant.
     """
     # Rows that are implausible for all filters of a node; the first is explained, by a function's fault if any has one.
-    faults = _FaultFinder(network, outputs, u)
+    faults = _NonFiniteFunctionFinder(network, outputs, u)
     lines = []
     for node, by_row in refused.items():
         first_row, why = next(iter(by_row.items()))
@@ -205,7 +205,7 @@ def describe_doubts(
     return lines
 
 
-class _FaultFinder:
+class _NonFiniteFunctionFinder:
     """Names functions of the filters' models that returned no number in a recording."""
 
     def __init__(self, network: Network, outputs: Mapping[str, PyTree], u: Float[np.ndarray, "steps inputs"]):

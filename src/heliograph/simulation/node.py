@@ -313,7 +313,7 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
             check_received(f"filter {name!r}", filter, received)
 
 
-def describe_received(node: Node | ReceivingNode) -> object:
+def get_parts_of_reception(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements; nodes where their structure is one are a group."""
     if isinstance(node, Node):
         places = None if node.encoder is None else find_carried_components(node.channel)

@@ -59,7 +59,7 @@ class FilteringTask(NamedTuple):
         return numbers, self.u, z, self.arrivals
 
 
-def read_origin(filters: AllFilters, after: Record, smooths: bool) -> Origin:
+def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> Origin:
     """Return where the rows of a record ended, with the states there of these filters.
 
     Args:
@@ -82,7 +82,7 @@ def read_origin(filters: AllFilters, after: Record, smooths: bool) -> Origin:
     return origin
 
 
-def join_behind(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
+def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
     """Return the times of rows (`clock`) behind that of the last row before them, where `origin` has one.
 
     Raises:
@@ -111,8 +111,8 @@ def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) ->
     if results is not None:
         return results
     # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
-    by_xla = any(mesh.is_long or mesh.needs_joint for mesh in task.filters.meshes.values())
-    return _scan_in_parts(task, z, judged) if by_xla else compute_once(_run_filters, _by_xla, (task, z, judged))
+    by_xla = any(mesh.has_long_step or mesh.needs_joint for mesh in task.filters.meshes.values())
+    return _scan_in_parts(task, z, judged) if by_xla else compute_once(_scan_all_rows, _by_xla, (task, z, judged))
 
 
 class NetworkRecursion(Recursion):
@@ -164,7 +164,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
     return to_numpy(_collect_results(smoother, z, states, all_rows))
 
 
-def _run_filters(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+def _scan_all_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
     """Return what `filter_rows` does, of all rows in one scan."""
     return _collect_results(task.smoother, z, *_scan_rows(task.filters, task.first_states(), task.rows(z), judged))
 
@@ -224,5 +224,5 @@ def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> P
     return before
 
 
-_by_xla, _scanned_by_xla = quickly_compiled(_run_filters), quickly_compiled(_scan_rows)
+_by_xla, _scanned_by_xla = quickly_compiled(_scan_all_rows), quickly_compiled(_scan_rows)
 _central_states_by_xla = quickly_compiled(_collect_central_states)

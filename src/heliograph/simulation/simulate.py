@@ -24,7 +24,7 @@ from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
-from heliograph.simulation.precomputed_filters import has_plan, plan_filters
+from heliograph.simulation.precomputed_filters import can_precompute, precompute_filters
 from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
@@ -118,7 +118,7 @@ def monte_carlo(
             return _warn_of_invalid_numbers(by_native_code, network)
     # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
-    planned = plan_filters(filters, u) if has_plan(filters) else filters
+    planned = precompute_filters(filters, u) if can_precompute(filters) else filters
     job = _SimulationJob(
         world=World(drop_identities(network.plant), make_reception(network), planned),
         later=None if smoothing is None else smoothing.smoother(filters),
@@ -137,7 +137,7 @@ def monte_carlo(
 
 def _has_long_step(network: "Network") -> bool:
     """Return whether a fusion between neighbours has too many operations a step to be written out as native code."""
-    return any(mesh.is_long for mesh in build_meshes(network).values())
+    return any(mesh.has_long_step for mesh in build_meshes(network).values())
 
 
 def _warn_of_invalid_numbers(result: Result, network: Network) -> Result:

@@ -19,7 +19,7 @@ from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.transmission.channel_draws import (
     PLANT,
     move_modes,
-    number_memories,
+    number_memory_seeds,
     start_modes,
 )
 from heliograph.simulation.transmission.reception import AbstractMedium
@@ -51,7 +51,7 @@ class World(Module):
     @property
     def _memory_numbers(self) -> np.ndarray:
         """Numbers that seed the draws of the plant's memories (memories,)."""
-        return number_memories({PLANT: self.plant}, self.plant)[PLANT]
+        return number_memory_seeds({PLANT: self.plant}, self.plant)[PLANT]
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step the world over step k: return its next state, and what is recorded of the step.

@@ -20,7 +20,7 @@ from heliograph.simulation.arguments import read_plant_inputs
 from heliograph.simulation.centres.observation_model import SharedObservation
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
-from heliograph.simulation.precomputed_filters import plan_filters
+from heliograph.simulation.precomputed_filters import precompute_filters
 
 REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 
@@ -156,9 +156,9 @@ def cross_covariances(
     instance("network", network, Network, "a Network")
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
-    filters, u = _plan_filters(alone, horizon, inputs)
+    filters, u = _plan_network_filters(alone, horizon, inputs)
     with jax.enable_x64(True):
-        factors: SourceFactors = to_numpy(_compute_factors(filters, u))
+        factors: SourceFactors = to_numpy(_compute_joint_error_factors(filters, u))
     return CrossCovariances(
         nodes=tuple(network.nodes_with(filter)),
         states=network.states,
@@ -186,13 +186,13 @@ def fused_covariances(
         ValueError: a network without an informed fusion.
     """
     instance("network", network, Network, "a Network")
-    filters, u = _plan_filters(network, horizon, inputs)
+    filters, u = _plan_network_filters(network, horizon, inputs)
     with jax.enable_x64(True):
-        results: dict[str, np.ndarray] = to_numpy(_compute_fused(filters, u))
+        results: dict[str, np.ndarray] = to_numpy(_compute_fused_covariances(filters, u))
     return results
 
 
-def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
+def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Return the network's filters, planned for the inputs, and the inputs (horizon, inputs).
 
     Raises:
@@ -205,11 +205,11 @@ def _plan_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> t
         raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
     if len(filters.linear_centres) < len(filters.centres):
         raise fail("covariances before data", "filters whose gains depend on no data", "some whose gains do")
-    return plan_filters(filters, u), u
+    return precompute_filters(filters, u), u
 
 
 @quickly_compiled
-def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
+def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
     """Return the joint covariance of all errors by its factors, after the steps of u, for the one informed fusion."""
     (centre,) = filters.linear_centres
     filter_states, _, _, (centre_state,), *_ = filters.init()
@@ -226,7 +226,7 @@ def _compute_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
 
 
 @quickly_compiled
-def _compute_fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
     """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u."""
 
     def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:

@@ -17,7 +17,7 @@ STEPS, LAST = 100, 40  # of the recursion of errors, and those at its end by whi
 SLOW = 1e-3  # growth a step that so few steps cannot tell from none
 
 
-def check_decay(
+def check_error_decay(
     what: str, graph: Graph, shares: np.ndarray, arrival: np.ndarray, plant: tuple[np.ndarray, np.ndarray],
     squares: np.ndarray,
 ) -> None:  # fmt: skip
@@ -36,7 +36,7 @@ def check_decay(
     """
     arrives = np.zeros(graph.present.shape)
     arrives[:, 1:][graph.present[:, 1:]] = arrival
-    growth, sizes = _compute_growth(graph, arrives, _make_error_maps(graph, shares, plant, squares))
+    growth, sizes = _compute_growth_and_sizes(graph, arrives, _make_error_maps(graph, shares, plant, squares))
     if growth > 1 + SLOW:
         raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
                    f"squares that grow by {growth:.3g} a step at node {graph.nodes[sizes.argmax()]!r}")  # fmt: skip
@@ -56,7 +56,7 @@ class _ErrorMaps(NamedTuple):
 def _make_error_maps(
     graph: Graph, shares: np.ndarray, plant: tuple[np.ndarray, np.ndarray], squares: np.ndarray
 ) -> _ErrorMaps:
-    """Return the step of the errors with the gains of the long run; arguments as of `check_decay`."""
+    """Return the step of the errors with the gains of the long run; arguments as of `check_error_decay`."""
     a, q = plant
     n = len(a)
     # P_i in the long run of a filter that receives all its neighbours' measurements, of information `total`: by STEPS
@@ -74,7 +74,7 @@ def _make_error_maps(
     )
 
 
-def _compute_growth(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tuple[float, np.ndarray]:
+def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tuple[float, np.ndarray]:
     """Return the growth of the errors' second moments in a step, in the long run, and their sizes by node in the end.
 
     With E[M] the mean of the step over what gets lost, J+ = E[M] J E[M]' and on the diagonal, since messages get lost
@@ -92,7 +92,7 @@ def _compute_growth(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tupl
     changes = np.concatenate([maps.pushed, maps.pulled], axis=3)  # D_j (node, degree, n, 2 n)
     joint, logarithms, itself = np.eye(nodes * n), [], np.arange(nodes)
     for _ in range(STEPS):
-        added = propagate_by_mode(changes, _take_pairs(joint.reshape(nodes, n, nodes, n), graph), 0.0)
+        added = propagate_by_mode(changes, _take_moments_of_pairs(joint.reshape(nodes, n, nodes, n), graph), 0.0)
         joint = np.asarray(propagate_by_mode(m, joint, 0.0))
         blocks = joint.reshape(nodes, n, nodes, n)  # a view: writing here changes `joint`
         blocks[itself, :, itself, :] += (variance * added).sum(axis=1)
@@ -104,7 +104,7 @@ def _compute_growth(graph: Graph, arrives: np.ndarray, maps: _ErrorMaps) -> tupl
     return growth, np.einsum("iaia->i", joint.reshape(nodes, n, nodes, n))
 
 
-def _take_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:
+def _take_moments_of_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:
     """Return E[(e_i, e_j) (e_i, e_j)'] of each node i and each sender j that it receives, (node, degree, 2 n, 2 n).
 
     `blocks`: E[e_i e_j'] of all nodes (node, n, node, n).

@@ -86,10 +86,10 @@ class FusionCentre(Module):
 
         `errors`: moments before step k. `filters`: matrices in the order of the nodes.
         """
-        step = self.compute_error_step(errors.state_mean, errors.state_covariance, filters, u, k)
+        step = self.compute_error_maps(errors.state_mean, errors.state_covariance, filters, u, k)
         return CentreStep(step, propagate_errors_jointly(errors, step))
 
-    def compute_error_step(
+    def compute_error_maps(
         self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
     ) -> ErrorStep:
         """Return the linear maps of the errors in step k, for a plant with these moments before it.
@@ -125,7 +125,7 @@ class FusionCentre(Module):
             # Moments of the plant's state: row 0 of the means, and its part of the factors.
             covariance = jnp.asarray(factors.state @ factors.state.T)
             matrices = compute_matrices(states, u_k, k)
-            step = self.compute_error_step(factors.mean[0], covariance, matrices, u_k, k)
+            step = self.compute_error_maps(factors.mean[0], covariance, matrices, u_k, k)
             return (step_filters(states, u_k, k), propagate_factors(factors, step, k)), None
 
         (_, factors), _ = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))
@@ -136,7 +136,7 @@ class FusionCentre(Module):
 
         `parts`: those of each source, with a leading axis of nodes.
         """
-        return gather_steps(parts, self.order, self.size)
+        return join_step_matrices(parts, self.order, self.size)
 
     def step(
         self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
@@ -164,7 +164,7 @@ MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, 
 Matrices = TypeVar("Matrices", LinearStep, Linearised)
 
 
-def gather_steps(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
+def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
     """Return the matrices of several groups of filters, one after another and then in this order.
 
     Axes as long as the measurement are padded with zeros to `size`.
@@ -207,7 +207,7 @@ def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shar
     if has_data_dependent_gains(nodes):
         _check_data_dependent_gains(rule, nodes, shared)
         return "nominal"
-    _check_linear(rule, plant, nodes)
+    _check_linear_and_planned(rule, plant, nodes)
     known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
     return lower_claim_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
@@ -227,7 +227,7 @@ def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
                    "data", "nodes that share a channel")  # fmt: skip
 
 
-def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
+def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     """Raise unless plant and sensors are linear, and the gains of all filters depend on no data."""
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
@@ -266,7 +266,7 @@ def _has_uncertain_law(channel: Channel) -> bool:
         return True
 
 
-class NodesFilters(Protocol):
+class NodeFiltersWithoutData(Protocol):
     """The nodes' filters as their centre steps them: without data, on which their gains do not depend."""
 
     @property
@@ -283,7 +283,7 @@ class NodesFilters(Protocol):
         """Return the filters' states after step k."""
 
 
-class CentreBelief(NamedTuple):
+class CentreFilterState(NamedTuple):
     """What the centre knows after a step.
 
     Args:
@@ -311,7 +311,7 @@ class CentreFilter(AbstractSizedFilter):
         quantized: whether reports are quantized.
     """
 
-    filters: NodesFilters
+    filters: NodeFiltersWithoutData
     links: ReportModel | OverTime
     rows: tuple[int, ...] = eqx.field(static=True)
     ages: int = eqx.field(static=True)
@@ -319,23 +319,25 @@ class CentreFilter(AbstractSizedFilter):
     quantized: bool = eqx.field(static=True)
 
     @compile_in_float64
-    def init(self) -> CentreBelief:
+    def init(self) -> CentreFilterState:
         """Return the state before any report."""
         states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
-        return CentreBelief(states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized))
+        return CentreFilterState(
+            states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
+        )
 
     @predicts
-    def predict(self, state: CentreBelief, u: ArrayLike = (), k: Step = 0) -> CentreBelief:
+    def predict(self, state: CentreFilterState, u: ArrayLike = (), k: Step = 0) -> CentreFilterState:
         """Predict plant and all errors; the nodes send their reports."""
         (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
         happened = centre.step_errors(state.errors, filters, u, step)
         following = self.filters.step_without_data(state.nodes, u, step)
-        return CentreBelief(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
+        return CentreFilterState(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
 
     @corrects
-    def correct(self, state: CentreBelief, z: ArrayLike, k: Step = 0) -> tuple[CentreBelief, Innovation]:
+    def correct(self, state: CentreFilterState, z: ArrayLike, k: Step = 0) -> tuple[CentreFilterState, Innovation]:
         """Correct with the reports that arrived, z of `rows`, NaN where one did not; return the innovation too."""
         nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
         reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
@@ -344,6 +346,6 @@ class CentreFilter(AbstractSizedFilter):
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 
     @estimates
-    def estimate(self, state: CentreBelief) -> Estimate:
+    def estimate(self, state: CentreFilterState) -> Estimate:
         """Return the best linear estimate of the plant's state."""
         return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

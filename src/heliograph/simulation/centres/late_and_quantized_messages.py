@@ -43,7 +43,7 @@ class ArrivingEstimates(NamedTuple):
     fresh: Bool[jax.Array, "node rounds degree"]
 
 
-def find_moved_beyond(
+def find_event_senders(
     alpha: Array, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip

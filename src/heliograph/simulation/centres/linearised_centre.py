@@ -24,7 +24,7 @@ from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.centres.fusion_centre import gather_steps
+from heliograph.simulation.centres.fusion_centre import join_step_matrices
 
 
 class LinearisedFusionState(NamedTuple):
@@ -83,7 +83,7 @@ class LinearisedCentre(Module):
             u: inputs of the plant over the step.
             k: number of the step.
         """
-        linear, reports = gather_steps(parts, self.order, self.size), jnp.concatenate(means)[self.order]
+        linear, reports = join_step_matrices(parts, self.order, self.size), jnp.concatenate(means)[self.order]
         plant = at(self.plant, k)
         # F_i = I - K_i C_i of all nodes (node, n, n).
         keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output
@@ -95,11 +95,11 @@ class LinearisedCentre(Module):
             moved = plant.transition(before.known, u) + plant.noise_mean()
             motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             # Moments of the errors, by which the rule weights the reports.
-            step = _make_shared_step(motion, keep, linear)
-            errors = _keep_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
+            step = _make_joint_error_step(motion, keep, linear)
+            errors = _replace_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
             # `AllReports` estimates the errors themselves, so that their means matter too.
             if isinstance(rule, AllReports):
-                drift = _compute_drift(before.rule, matrix, moved, keep, linear)
+                drift = _compute_drift_of_mean_errors(before.rule, matrix, moved, keep, linear)
                 step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
             rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
             following[name] = LinearisedFusionState(errors, known=mean, rule=rule_state)
@@ -107,7 +107,7 @@ class LinearisedCentre(Module):
         return following, results
 
 
-def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
+def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
     """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
 
     The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
@@ -123,7 +123,7 @@ def _make_shared_step(motion: Motion, keep: jax.Array, linear: Linearised) -> Er
     )
 
 
-def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
+def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
     """Return the moments of the errors `after` a step with those of the plant `before` it.
 
     Along estimates nobody knows the plant's own moments: its mean stays, and its covariance with all else.
@@ -134,7 +134,7 @@ def _keep_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMomen
     return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
 
 
-def _compute_drift(
+def _compute_drift_of_mean_errors(
     state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised
 ) -> jax.Array:
     """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.

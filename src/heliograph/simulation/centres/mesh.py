@@ -29,7 +29,7 @@ from heliograph.numerics.types import Array, Bool, Float, PyTree
 from heliograph.simulation.centres.late_and_quantized_messages import (
     ArrivingEstimates,
     MessagesOnTheWay,
-    find_moved_beyond,
+    find_event_senders,
     gather_messages,
     step_messages_on_the_way,
 )
@@ -61,7 +61,7 @@ class Mesh(Module):
         senders: numbers of the nodes of which each node receives (node, degree), itself first.
         places: numbers in the mesh of the nodes of each group of the network that the mesh estimates at.
         nodes: their names.
-        alpha: where nodes send on events, the threshold of `find_moved_beyond`.
+        alpha: where nodes send on events, the threshold of `find_event_senders`.
         quantizer: of the estimates that are sent, stacked by node.
         needs_joint: whether the rule needs the joint covariance of all nodes' errors.
         claim: of the nodes' estimates.
@@ -81,7 +81,7 @@ class Mesh(Module):
     claim: Claim = eqx.field(static=True)
 
     @property
-    def is_long(self) -> bool:
+    def has_long_step(self) -> bool:
         """Return whether a step has too many operations for native code, in which they are written one by one."""
         n = len(first(self.plant).states)
         # About n^2 operations for each message, and N^2 twice for a joint covariance of N = nodes n numbers.
@@ -211,7 +211,7 @@ class Mesh(Module):
             return now
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
         information = jax.vmap(invert)(state.covariance)[self.senders]
-        moved = find_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
+        moved = find_event_senders(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
     def compute_step_without_estimates(

@@ -102,7 +102,7 @@ def mean_mesh_errors(
         with jax.enable_x64(True):
             step = to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k)))
             blocks = np.asarray(blocks_of(joint.reshape(count, n, count, n), mesh.senders))
-            gains = to_numpy(_compute_gains(rows, covariance, blocks, patterns, step))
+            gains = to_numpy(_compute_gains_by_pattern(rows, covariance, blocks, patterns, step))
         joint, moments = _average_joint(mesh, joint, blocks, patterns, gains, step), step.plant
         errors.append(np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy())
         # The first pattern of each node stands for all: only diffusion reads this covariance, and by diffusion it is
@@ -123,10 +123,10 @@ def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
     links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _compute_pattern_probabilities(mesh, np.array(chances))
-    return patterns, _repeat_by_pattern(mesh, fusion.rule.placed(graph), patterns)
+    return patterns, _repeat_nodes_by_pattern(mesh, fusion.rule.placed(graph), patterns)
 
 
-def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
+def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
     """Return the mesh with a row for each pattern of each node in place of one for each node.
 
     `rule`: placed on the nodes, which are the last axis of its arrays.
@@ -138,7 +138,7 @@ def _repeat_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatter
 
 
 @quickly_compiled
-def _compute_gains(
+def _compute_gains_by_pattern(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
     """Return the gains of each pattern, with a leading axis of patterns: weights for what arrives in it.

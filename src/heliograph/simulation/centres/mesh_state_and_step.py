@@ -129,7 +129,7 @@ def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEst
     """Return what nodes received, with covariances that hold where neighbours send on events alone.
 
     What a neighbour sent last errs by more than its estimate of covariance P: by (1 + sqrt(alpha n))^2 P at most, see
-    `find_moved_beyond`. A node's own estimate, the first, is as it is.
+    `find_event_senders`. A node's own estimate, the first, is as it is.
 
     Args:
         received: estimates, with a leading axis of nodes.

@@ -90,7 +90,7 @@ class NodeFilter(AbstractSizedFilter):
         # Measurements z_i = M_i x + o_i + nu_i of the node and its neighbours, without padding.
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _ = self._take_apart(jnp.asarray(z), state.before)
+        sensed, _ = self._split_measurements(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return after, no_innovation()
@@ -111,7 +111,7 @@ class NodeFilter(AbstractSizedFilter):
         message = before.mean[0], before.covariance[0]
         return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
 
-    def _take_apart(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
+    def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
 
         Rows of these: the node's own, then its neighbours'. Where no message came, the mean is NaN, and the covariance
@@ -131,7 +131,7 @@ class NodeFilter(AbstractSizedFilter):
 
     def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
-        sensed, all_nodes = self._take_apart(z, before)
+        sensed, all_nodes = self._split_measurements(z, before)
         # What did not come is NaN, so that all is said to arrive.
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
@@ -152,7 +152,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
-    mesh = _build_row(network, fusion, node)
+    mesh = _build_one_node_mesh(network, fusion, node)
     # What the filter receives: the node's own measurement, then a message of each neighbour.
     sizes = tuple(network.nodes[name].received for name in mesh.nodes)
     own, *of_neighbours = sizes
@@ -164,13 +164,13 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         claim=mesh.claim,
         states=network.states,
         inputs=network.inputs,
-        received=own + sum(_count_numbers(len(network.states), size) for size in of_neighbours),
+        received=own + sum(_count_message_numbers(len(network.states), size) for size in of_neighbours),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
     return with_premise(filter, find_premise(network, node))
 
 
-def _build_row(network: Network, fusion: str, node: str) -> Mesh:
+def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
     """Return the part of a fusion between neighbours that estimates at one node, from itself and its neighbours.
 
     To it every message arrives; one that did not is a message of NaN. `fusion` and `node`: names.
@@ -233,11 +233,11 @@ def node_network(network: Network, node: str) -> Network:
     if text("node", node) not in nodes:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
-    received = {j: _count_numbers(len(network.states), network.nodes[j].received) for j in senders}
+    received = {j: _count_message_numbers(len(network.states), network.nodes[j].received) for j in senders}
     parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
     return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
 
 
-def _count_numbers(n: int, size: int) -> int:
+def _count_message_numbers(n: int, size: int) -> int:
     """Return how many numbers a neighbour's message has: mean (n), covariance (n, n) and measurement (size)."""
     return n + n * n + size

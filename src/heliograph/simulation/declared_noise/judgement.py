@@ -20,11 +20,11 @@ from heliograph.random_affine.reported_law import AbstractTold
 from heliograph.simulation.declared_noise.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared_noise.refit import (
     DeclaredRows,
-    LinkPlace,
+    ReceivedLinkPlace,
     Refit,
     find_interval_end,
-    find_place,
-    list_declaring,
+    find_link_place,
+    list_links_declaring_noise,
     list_noise_variances,
     refit_filter,
     refit_scales,
@@ -164,7 +164,7 @@ def judge_declared(
             wrong shape, fewer than 20 rows with values.
     Source: Ljung and Box (1978) for the correlations; Newey and West (1987) for errors where gains are random.
     """
-    links = list_declaring(filter) if isinstance(filter, ToldFilter) else []
+    links = list_links_declaring_noise(filter) if isinstance(filter, ToldFilter) else []
     if len(links) != 1:
         got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
         expected = "one whose link tells the variance of its Gaussian noise (hg.model.told)"
@@ -201,7 +201,7 @@ def judge_declared_links(
     z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
     if not isinstance(filter, ToldFilter):
         return ()
-    judged = [_judge_link(filter, link, z, u)[0] for link in list_declaring(filter)]
+    judged = [_judge_link(filter, link, z, u)[0] for link in list_links_declaring_noise(filter)]
     return tuple(judgement for judgement in judged if judgement is not None)
 
 
@@ -210,7 +210,7 @@ def _judge_link(
 ) -> tuple[DeclaredJudgement | None, int]:
     """Return the judgement of one link, None where too few of its values came; and how many rows had some.
 
-    `link`: its number, as of `list_declaring`. `z` and `u`: measurements and inputs.
+    `link`: its number, as of `list_links_declaring_noise`. `z` and `u`: measurements and inputs.
     """
     declared, classes = _classify_rows(filter, link, z, u)
     heard = int(np.sum(classes >= 0))
@@ -230,7 +230,7 @@ def _judge_link(
     return _make_judgement(declared, classes, (before, after), scales, bias), heard
 
 
-class _DeclaredNoises(eqx.Module):
+class _DeclaredVariances(eqx.Module):
     """The variances of a told link's noises as a function of the numbers that it is told."""
 
     told: AbstractTold
@@ -241,7 +241,7 @@ class _DeclaredNoises(eqx.Module):
 
 
 def _compute_declared_variances(
-    place: LinkPlace, z: Float[np.ndarray, "steps received"]
+    place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
 ) -> Float[np.ndarray, "steps outputs"]:
     """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
 
@@ -250,7 +250,7 @@ def _compute_declared_variances(
     numbers = z[:, place.numbers]
     complete = ~np.isnan(numbers).any(axis=1)[:, None]
     filled = np.where(complete, numbers, np.asarray(place.told.typical))
-    variances = np.asarray(over_runs(_DeclaredNoises(place.told), filled))
+    variances = np.asarray(over_runs(_DeclaredVariances(place.told), filled))
     return np.asarray(np.where(complete, variances, np.nan))
 
 
@@ -264,11 +264,11 @@ def _classify_rows(
     Returns:
         The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
     """
-    z, place = z.copy(), find_place(filter, link)
+    z, place = z.copy(), find_link_place(filter, link)
     with np.errstate(all="ignore"):
         # Messages whose numbers give no positive variance count as lost: they would spoil the filter's state.
-        for number in list_declaring(filter):
-            declaring = find_place(filter, number)
+        for number in list_links_declaring_noise(filter):
+            declaring = find_link_place(filter, number)
             valid = np.all(_compute_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
             z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
         variances = _compute_declared_variances(place, z)

@@ -62,12 +62,12 @@ class DeclaredRows(NamedTuple):
         return len(self.edges) + 1
 
     @property
-    def place(self) -> "LinkPlace":
+    def place(self) -> "ReceivedLinkPlace":
         """Return where the link stands in what is received."""
-        return find_place(self.filter, self.link)
+        return find_link_place(self.filter, self.link)
 
 
-class LinkPlace(NamedTuple):
+class ReceivedLinkPlace(NamedTuple):
     """Where a link that tells numbers stands in what is received, and which of the sensor's outputs it carries.
 
     Args:
@@ -83,7 +83,7 @@ class LinkPlace(NamedTuple):
     outputs: list[int] | None
 
 
-def find_place(filter: ToldFilter, link: int) -> LinkPlace:
+def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
     """Return the place of one of the links that tell numbers.
 
     Args:
@@ -97,7 +97,7 @@ def find_place(filter: ToldFilter, link: int) -> LinkPlace:
     of_link = np.flatnonzero(numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
     whole = len(of_link) == len(filter.values)  # all that is received comes over this link
     outputs = list(range(len(sensor.outputs))) if whole else of_link
-    return LinkPlace(
+    return ReceivedLinkPlace(
         told=maps[link],
         numbers=[filter.numbers[column] for column in columns],
         values=[filter.values[row] for row in of_link],
@@ -105,7 +105,7 @@ def find_place(filter: ToldFilter, link: int) -> LinkPlace:
     )
 
 
-class ScaledNoise(eqx.Module):
+class LinkWithScaledNoise(eqx.Module):
     """The link that declared numbers give, its noise times the scale of their class.
 
     Args:
@@ -135,10 +135,10 @@ class ScaledNoise(eqx.Module):
 
 def list_noise_variances(link: AbstractRandomAffine) -> jax.Array:
     """Return the variances of all noises inside a link, one after another."""
-    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _list_noises(link)])
+    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _list_link_noises(link)])
 
 
-def list_declaring(filter: ToldFilter) -> list[int]:
+def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
     """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
     maps = told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
     return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
@@ -150,12 +150,12 @@ def _declares_noise(affine: ToldMap) -> bool:
     if isinstance(affine.make, ToldGainHop):
         return False
     typical = np.asarray(affine.typical)
-    noises, moved = (_list_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
+    noises, moved = (_list_link_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
     changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
     return changes and all(isinstance(noise, Gaussian) for noise in noises)
 
 
-def _list_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
+def _list_link_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
     """Return all noises inside a link."""
     return [leaf for leaf in jax.tree.leaves(link, is_leaf=_is_noise) if _is_noise(leaf)]
 
@@ -180,7 +180,7 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
         """Return the judged link's map with its noise scaled; anything else as it is."""
         if not isinstance(leaf, ToldMap) or leaf.memory.identity != place.told.memory.identity:
             return leaf
-        scaled = ScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
+        scaled = LinkWithScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
         return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
 
     link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
@@ -229,13 +229,13 @@ def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
 
     `scales`: the best without a bias, from which the search begins.
     """
-    step = usual_step(declared)
+    step = find_median_step(declared)
     white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
     return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
 
 
-def usual_step(declared: DeclaredRows) -> float:
+def find_median_step(declared: DeclaredRows) -> float:
     """Return the median time of a step of the recording; 1 where the plant counts steps."""
     inputs = declared.filter.inputs
     return float(np.median(declared.u[:, inputs.index(TIME_STEP)])) if TIME_STEP in inputs else 1.0
@@ -289,7 +289,7 @@ def _maximise_likelihood(
     low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
     has_bias = len(start) > declared.classes
     if has_bias:
-        time_step = usual_step(declared)
+        time_step = find_median_step(declared)
         low[-1], high[-1] = np.log(FAST * time_step), np.log(SLOW * len(declared.z) * time_step)
     likelihood = RefitLikelihood(declared)
     moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone

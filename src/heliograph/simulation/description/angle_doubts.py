@@ -24,7 +24,7 @@ WIDE = 1.0  # rad: a Gaussian of this deviation has E cos = 0.61, and what lies 
 REMEDY = "on the circle that is no Gaussian any more: start from an angle that data show"
 
 
-def largest_deviation(filter: AbstractFilter) -> float:
+def find_largest_usable_deviation(filter: AbstractFilter) -> float:
     """Return the deviation of an angle up to which a filter can take it for a Gaussian, in radians.
 
     No more than WIDE; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may not lie
@@ -41,25 +41,25 @@ def largest_deviation(filter: AbstractFilter) -> float:
     return WIDE
 
 
-def warn_wide_at_start(network: Network) -> Iterator[str]:
+def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
     lines: dict[tuple[str, str, float], list[str]] = {}
-    for node, label, filter in _find_filters(network):
+    for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(filter.estimate(filter.init()).covariance)
         for name, deviation in _yield_deviations(network, filter, covariance):
-            if deviation > largest_deviation(filter):
+            if deviation > find_largest_usable_deviation(filter):
                 lines.setdefault((name, label, float(deviation)), []).append(node)
     for (name, label, known), nodes in lines.items():
         where = f"{label!r} of {', '.join(map(repr, nodes[:3]))}{', ...' if len(nodes) > 3 else ''}"
         yield f"wide angle: {where} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
 
 
-def warn_wide_in_rows(network: Network, record: Record) -> Iterator[str]:
+def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that knew an angle less well in some row than it can use."""
-    for node, label, filter in _find_filters(network):
+    for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(record.estimates[node][label].covariance)
         for name, deviation in _yield_deviations(network, filter, covariance):
-            wide = np.flatnonzero(deviation > largest_deviation(filter))
+            wide = np.flatnonzero(deviation > find_largest_usable_deviation(filter))
             if wide.size:
                 known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
                 rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
@@ -89,7 +89,7 @@ class WideAngles:
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
         self.received = {} if used is None else {i: names[i] for i in used.received}
-        self._most = largest_deviation(filter) if self.states else np.inf
+        self._most = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
         """Return a row and a line for each received angle that is beyond a full turn for the first time."""
@@ -97,7 +97,7 @@ class WideAngles:
         for i in list(self.received):
             far = np.flatnonzero(np.abs(values[:, i]) > TURN)
             if far.size:
-                said.append((int(far[0]), say_degrees(self.received.pop(i), values[far[0], i])))
+                said.append((int(far[0]), doubt_degrees(self.received.pop(i), values[far[0], i])))
         return said
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
@@ -111,7 +111,7 @@ class WideAngles:
         return said
 
 
-def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
+def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
     """Yield (node, name, filter) of the filters that have angles."""
     if not first(network.plant).circular:
         return
@@ -131,7 +131,7 @@ def _yield_deviations(
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
 
 
-def warn_degrees_at_start(network: Network) -> Iterator[str]:
+def doubt_degrees_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle that a model has beyond a full turn before any data, as degrees are.
 
     Looked at are initial means of states, limits of nodes, and what sensors measure at that mean with inputs of 1.
@@ -140,7 +140,7 @@ def warn_degrees_at_start(network: Network) -> Iterator[str]:
     start, u = np.asarray(plant.initial_mean, dtype=float), np.ones(len(plant.inputs))
     # Initial means.
     for i in plant.angles:
-        if line := say_degrees(plant.states[i], start[i]):
+        if line := doubt_degrees(plant.states[i], start[i]):
             yield f"degrees: the initial mean of {line}"
     # The larger limit of each angle that a node receives.
     for name, angles in network.angles.items():
@@ -149,7 +149,7 @@ def warn_degrees_at_start(network: Network) -> Iterator[str]:
             continue
         for i in angles:
             ends = [float(end[i]) for end in (limits.low, limits.high) if np.isfinite(end[i])]
-            if line := say_degrees(node.received_names[i], max(ends, key=abs, default=0.0)):
+            if line := doubt_degrees(node.received_names[i], max(ends, key=abs, default=0.0)):
                 yield f"degrees: a limit at node {name!r} of {line}"
     # Angles that sensors measure.
     for sensor in list_sensors(network):
@@ -157,16 +157,16 @@ def warn_degrees_at_start(network: Network) -> Iterator[str]:
             with jax.enable_x64(True):
                 measured = np.asarray(sensor.under(plant.inputs, u).measure(jnp.asarray(start)))
             for i in sensor.angles:
-                if line := say_degrees(sensor.outputs[i], measured[i]):
+                if line := doubt_degrees(sensor.outputs[i], measured[i]):
                     yield f"degrees: what a sensor measures at the initial mean of {line}"
 
 
-def say_degrees(name: str, value: float) -> str:
+def doubt_degrees(name: str, value: float) -> str:
     """Return a line that this value of the angle `name` is beyond a full turn; "" where it is not."""
     return f"{name!r}, an angle in radians, is {value:.4g}, beyond 2 pi: degrees?" if abs(value) > TURN else ""
 
 
-def warn_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
+def doubt_angles_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
     """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
     for name, angles in network.angles.items():
         names = network.nodes[name].received_names if angles else ()

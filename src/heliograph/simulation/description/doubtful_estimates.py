@@ -38,10 +38,10 @@ def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
     """
     instance("network", network, Network, "a Network")
     instance("record", record, Record, "a Record")
-    return *_warn_unseen_at_end(network, record), *_warn_at_limits(network, record)
+    return *_doubt_unseen_states(network, record), *_doubt_states_at_limits(network, record)
 
 
-def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
+def _doubt_unseen_states(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each filter that ends where no sensor shows a state that one showed at the start.
 
     A state is shown where an output within n steps depends on it, as far as the filter looks (`_FilterView`). Where
@@ -53,7 +53,7 @@ def _warn_unseen_at_end(network: Network, record: Record) -> Iterator[str]:
     if not isinstance(plant, AbstractPlant) or isinstance(plant, ModalPlant):
         return
     limited = {name for name, _ in plant.limits}
-    for node, label, filter, sensors in _find_filters(network):
+    for node, label, filter, sensors in _yield_filters_with_covariance(network):
         # A filter of one Gaussian, of a nonlinear sensor and of models that do not vary.
         transform = getattr(filter, "transform", None)
         if not isinstance(transform, AbstractTransform):
@@ -91,14 +91,14 @@ def _find_unseen_states(
     return np.asarray(unseen)
 
 
-def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
+def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
     """Yield a line for each state with limits that a filter has at one of them in most rows.
 
     A filter says mean and deviation of its Gaussian given the limits. One whose mean is held at a limit has the mean
     sqrt(2 / pi) s inside it, and the deviation sqrt(1 - 2 / pi) s: of ratio HELD, and of a larger one where the mean
     is inside. That holds of one limited state; of several, of which each changes those before it, nearly.
     """
-    for node, label, filter, _ in _find_filters(network):
+    for node, label, filter, _ in _yield_filters_with_covariance(network):
         if not isinstance(filter, LimitedFilter):
             continue
         estimate = record.estimates[node][label]
@@ -116,7 +116,7 @@ def _warn_at_limits(network: Network, record: Record) -> Iterator[str]:
                     )
 
 
-def _find_filters(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
+def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
     """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
     every = list_sensors(network)
     for name, node in network.nodes.items():

@@ -12,14 +12,14 @@ from heliograph.simulation.network import FUSED, Network
 Place = tuple[str, str]  # node and filter
 
 
-def find_remarking(network: Network) -> tuple[Place, ...]:
+def find_remarking_filters(network: Network) -> tuple[Place, ...]:
     """Return the places of the filters that may remark on their state."""
     places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
     fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
     return *places, *fused
 
 
-def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
+def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
     """Yield each remark that a filter makes on its state, with the filter's place.
 
     Args:
@@ -27,7 +27,7 @@ def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remar
         state: states of all its filters, as the step of the network has them.
     """
     alike, central, *_ = state
-    for node, name in find_remarking(network):
+    for node, name in find_remarking_filters(network):
         if node == FUSED:
             fusion = network.fused[name]
             assert isinstance(fusion, AbstractFilter)
@@ -40,6 +40,6 @@ def list_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remar
         yield (node, name), network.nodes[node].filters[name].remark(of_filter)
 
 
-def say_remarks(network: Network, state: PyTree) -> list[str]:
+def describe_remarks(network: Network, state: PyTree) -> list[str]:
     """Return a line for each filter to whose state something happened."""
-    return [f"{node}/{name}: {said.words}" for (node, name), said in list_remarks(network, state) if said.times]
+    return [f"{node}/{name}: {said.words}" for (node, name), said in yield_remarks(network, state) if said.times]

@@ -21,7 +21,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models_with_calls(network):
         if id(model) not in seen:
-            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _list_arrays(model, functions))), None)
+            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _yield_arrays(model, functions))), None)
         rounded = seen[id(model)]
         if rounded is not None:
             parts.setdefault(rounded, []).append(name)
@@ -45,7 +45,7 @@ def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, l
         yield "relays", network.relays, []
 
 
-def _list_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
+def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
     """Yield the arrays of a model, and those that its functions hold."""
     yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
     for function, arguments in functions:

@@ -16,7 +16,7 @@ from heliograph.simulation.network import Network
 SHOWN = 3  # of many that are refused for one reason
 
 
-def list_fallbacks(network: Network) -> list[str]:
+def explain_xla_fallbacks(network: Network) -> list[str]:
     """Return a line for each reason for which XLA computes filters or fusions: who, and why."""
     by_reason: dict[str, list[str]] = {}
     for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
@@ -24,7 +24,7 @@ def list_fallbacks(network: Network) -> list[str]:
     return [f"{_join_first_names(refused)}: {why}" for why, refused in by_reason.items()]
 
 
-def list_sequential(network: Network) -> str:
+def describe_sequential_filters(network: Network) -> str:
     """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
     sequential = [who for who, filter in _list_filters(network) if not filter.is_linear]
     return _join_first_names(sequential) if sequential else ""
@@ -57,7 +57,7 @@ def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each fusion between neighbours whose step is too long to be written out."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
-        if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).is_long:
+        if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).has_long_step:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
 
 

@@ -29,7 +29,7 @@ from heliograph.simulation.results.plots import (
     legend_outside,
     make_panels,
 )
-from heliograph.simulation.results.saved_datasets import Saved
+from heliograph.simulation.results.saved_datasets import SavableResults
 from heliograph.simulation.results.statistics import ErrorStatistics, expand_pairs
 
 if TYPE_CHECKING:  # extras
@@ -41,7 +41,7 @@ STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
 
 
 @readable
-class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
+class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
     """Error statistics by node and filter; fused ones under "fused".
 
     `smoothed` holds statistics of estimates given later data too, None where these were not asked for. They are saved

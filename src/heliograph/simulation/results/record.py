@@ -43,9 +43,9 @@ from heliograph.simulation.results.plots import (
     legend_outside,
     make_panels,
 )
-from heliograph.simulation.results.record_html import draw_record
+from heliograph.simulation.results.record_html import write_record_html
 from heliograph.simulation.results.refusal_counts import Refusal, list_refusals
-from heliograph.simulation.results.saved_datasets import Saved
+from heliograph.simulation.results.saved_datasets import SavableResults
 from heliograph.simulation.results.wide_table import make_frame, read_frame
 
 if TYPE_CHECKING:  # extras
@@ -66,7 +66,7 @@ Weights = TypeAliasType("Weights", dict[str, dict[str, Weighed]])  # by node and
 
 @readable
 @dataclass(frozen=True)
-class Record(Saved):
+class Record(SavableResults):
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     Args:
@@ -109,7 +109,7 @@ class Record(Saved):
 
     def _repr_html_(self) -> str:
         """Draw the estimates with their bands, for notebooks."""
-        return draw_record(self)
+        return write_record_html(self)
 
     def with_origin(self, origin: Origin) -> "Record":
         """Return the same record with the states in which its filters ended."""

@@ -74,7 +74,7 @@ def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> di
     }
 
 
-def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
+def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
     """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter."""
     parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
     modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
@@ -85,7 +85,7 @@ def collect_modes(network: Network, batch: PyTree) -> dict[tuple[str, str], np.n
     return modes
 
 
-def collect_weighed(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
+def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Return the innovations of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}

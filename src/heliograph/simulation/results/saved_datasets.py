@@ -21,7 +21,7 @@ NETCDF, ZARR = ".nc", ".zarr"
 MARK = "zarr.json"  # what a Zarr folder has, and nothing else
 
 
-class Saved:
+class SavableResults:
     """Results that convert to and from a dataset, and so to and from a file with `save` and `open`."""
 
     states: tuple[str, ...]

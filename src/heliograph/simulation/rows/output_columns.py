@@ -12,7 +12,7 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.trees.flat import FlatLayout
 from heliograph.numerics.types import Float, PyTree
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.results_by_name import collect_modes, split_by_name
+from heliograph.simulation.results.results_by_name import collect_mode_probabilities, split_by_name
 
 
 class JudgementColumns(NamedTuple):
@@ -82,7 +82,8 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
     covariance = split_by_name(network, numbered, attrgetter("covariance"), axis=-4)
     judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
     modes = {
-        name: (int(columns[0]), int(columns[-1]) + 1) for name, columns in collect_modes(network, numbered).items()
+        name: (int(columns[0]), int(columns[-1]) + 1)
+        for name, columns in collect_mode_probabilities(network, numbered).items()
     }
     tested = {(FUSED, name): TestColumns(*map(int, columns)) for name, columns in numbered["tested"].items()}
     return tuple(

@@ -17,7 +17,7 @@ from heliograph.numerics.trees.flat import FlatLayout, flatten_to_row, make_flat
 from heliograph.numerics.trees.program_text import write_program_text
 from heliograph.numerics.trees.static import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.description.filter_remarks import find_remarking, list_remarks
+from heliograph.simulation.description.filter_remarks import find_remarking_filters, yield_remarks
 from heliograph.simulation.implausible_data import step_plausibly
 from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters, initial_states
@@ -159,7 +159,7 @@ class RowStep:
     @cached_property
     def remarking(self) -> tuple[tuple[str, str], ...]:
         """Return node and name of each filter that may say what happened to its state."""
-        return find_remarking(self._network)
+        return find_remarking_filters(self._network)
 
     def read_remarks(self, state: Float[np.ndarray, " state"]) -> dict[tuple[str, str], Remark]:
         """Return what each of these filters says of its state, by node and name.
@@ -167,7 +167,7 @@ class RowStep:
         Args:
             state: the states after a row, as they are laid out.
         """
-        return dict(list_remarks(self._network, self.state.tree(state)))
+        return dict(yield_remarks(self._network, self.state.tree(state)))
 
     @cached_property
     def program(self) -> str:

@@ -37,7 +37,7 @@ MemoryNumbers = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memor
 PLANT = "plant"  # whose memories others may share, with a name or without
 
 
-def number_memories(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
+def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
     """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
 
     They come from the memories' names, or from the channel's where these have none.
@@ -90,12 +90,12 @@ class ChannelGroup(Module):
     places: np.ndarray
 
 
-def channel_groups(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
+def group_channels(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
     """Return the channels by structure: those of one are stacked, with a row for each name.
 
     Names of memories do not matter to the structure.
     """
-    listed, memories = list(channels.values()), list(number_memories(channels).values())
+    listed, memories = list(channels.values()), list(number_memory_seeds(channels).values())
     checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
     # Rows of each structure's channels, by the objects' identities: one object under many names is stacked once.
     unnamed = {identity: drop_names(channel) for identity, channel in {id(c): c for c in listed}.items()}
@@ -128,7 +128,7 @@ class LateChannelState(NamedTuple):
     line: jax.Array
 
 
-def start(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
+def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
     """Return a channel's state before the first step of the run with this key.
 
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
