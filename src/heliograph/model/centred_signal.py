@@ -1,4 +1,4 @@
-"""Signals that cost less: what sender and receiver both expect is taken off before sending and added back after."""
+"""Centred signals, which cost less: a reference that both ends know is subtracted before sending, added back after."""
 
 from typing import overload
 

@@ -1,4 +1,4 @@
-"""What comes with a message: gains, readings of gains and numbers of quality that the receiver is told.
+"""Channel side information: gains, pilots' readings of gains, and numbers of quality that come with each message.
 
 A channel that tells delivers z, and then the told numbers, of which the law of its link is a function.
 """

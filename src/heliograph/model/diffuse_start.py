@@ -1,4 +1,4 @@
-"""A start that nobody knows: the limit of a covariance that grows without bound, of all states or of named ones."""
+"""Diffuse initial states: the limit of an initial covariance that grows without bound, of all or of named states."""
 
 from collections.abc import Sequence
 from typing import NoReturn

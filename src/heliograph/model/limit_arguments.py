@@ -1,4 +1,4 @@
-"""Intervals as users give them: of received numbers, and of what a plant's states can be."""
+"""Limits as users give them, read as intervals (low, high): of received numbers, and of a plant's states."""
 
 from collections.abc import Mapping, Sequence
 

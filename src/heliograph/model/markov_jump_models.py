@@ -1,4 +1,4 @@
-"""Plants of several laws of motion, and sensors that work or fail: models of which a Markov chain has one at each step.
+"""Markov jump models: of several laws of motion, or several sensors, a Markov chain picks the one of each step.
 
 The mode of a step moves the plant and measures in it: r_1 ~ pi_0, x_1 = f_(r_1)(x_0, u) + w, z_1 = h_(r_1)(x_1) + v;
 then r_2 ~ T[r_1, .].

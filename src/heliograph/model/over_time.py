@@ -1,4 +1,4 @@
-"""The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
+"""Models that vary over time: the marker `OverTime`, whose leading axis is time, and `at`, the model of one step."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar

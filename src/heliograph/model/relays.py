@@ -218,6 +218,7 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
             gain[np.ix_(received, sent)] = moments.mean_gain
             offset[received] += moments.offset
             sent_and_one = np.append(sent, columns)  # the offset stands behind the gains of all that is sent
+            # Covariances of the link's gains and offset, (outputs, outputs, inputs + 1, inputs + 1).
             spread[np.ix_(received, received, sent_and_one, sent_and_one)] += moments.nominal.center
             receives[received], transmits[senders.index(sender)] = 1.0, 1.0
     return _SlotMoments(gain=gain, offset=offset, spread=spread, receives=receives, transmits=transmits)

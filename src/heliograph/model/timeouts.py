@@ -1,4 +1,4 @@
-"""Silences of a recording that are longer than the timeouts of its nodes."""
+"""Timeouts of nodes: the silences of a recording that are longer, by node."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Whether a function of states knows that a full turn of an angle, or of an attitude, is none."""
+"""Whether a function of states returns the same after a full turn (2 pi) of an angle, or of an attitude."""
 
 from collections.abc import Callable, Sequence
 

@@ -150,7 +150,8 @@ def _join_links(network: Network, states: int) -> JointLinks:
     for memory in memories(joint).values():
         if memory.is_uncertain:
             raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
-    modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
+    # A drifting gain is put on a grid of two values: enough to know that it is random.
+    modes = joint_modes(joint, 2)
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
     # Modes that can occur. Entry j of p (I + T)^M, with p the initial law, T the chain and M its number of modes, sums
     # the weights of all ways to mode j in at most M steps; it is positive if there is one.
@@ -181,7 +182,7 @@ def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, 
 
 
 class UsableMeasurements(NamedTuple):
-    """Usable measurements of a receiver, by kind of losses.
+    """What a receiver can use of its measurements: sums of known gain, by the kind of losses that it sees.
 
     Args:
         system: the plant, measured by sums of what arrives.

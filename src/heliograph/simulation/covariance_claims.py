@@ -1,4 +1,4 @@
-"""What a claim is in a network: the filter's own where it believes the world of its place, else nominal at most.
+"""Claims (exact, upper, nominal) of a network's covariances: a filter's own where its model is the world, else nominal.
 
 A premise is the world that a filter was made for, or in which it stands: plant, sensor, channel and so on.
 """
@@ -29,7 +29,7 @@ UNSAID = "something that it does not say"
 
 
 class MistakenBelief(NamedTuple):
-    """What a filter of a network believes that is not so at its place.
+    """A filter of a network, and the parts of its model that differ from the world at its node.
 
     Args:
         node: name of the node; `FUSED` for a filter of all measurements.

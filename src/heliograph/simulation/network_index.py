@@ -10,7 +10,7 @@ from heliograph.model.over_time import structure_key
 
 
 class AlikeFilters(NamedTuple):
-    """Filters that differ in numbers alone: `filters` of the nodes of one group."""
+    """Filters that differ in numbers alone, one kind: those of the names `filters` at the nodes of one group."""
 
     group: int
     filters: tuple[str, ...]

@@ -114,10 +114,10 @@ class Node(Module):
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
         self.limits = make_limits(self.received, limits, invalid, stuck, self.sensor, self.channel)
-        # Flags of the step that each filter's model has. A sensor with feedback sends what the informed filter did not
-        # predict: no other filter could use that.
+        # A channel may deliver a flag of its mode beside the measurement: refused unless the filter's model has it too.
         for name, filter in self.filters.items():
             check_flags(f"filter {name!r}", filter, [first(channel)])
+        # A sensor with feedback sends what the informed filter did not predict: no other filter could use that.
         receiving = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and receiving != [self.informed_by]:
             expected = f"no filter with measurements besides {self.informed_by!r}"

@@ -63,16 +63,16 @@ class World(Module):
 
         Returns:
             The next state, and "truth" (n,), "measurements" (node, received) by group, "transmissions" by group, and
-            all that `AllFilters.step` puts out.
+            all that `AllFilters.step` puts out, with estimated angles within half a turn of the true ones.
         """
         (x, medium, states, edges, modes), (k, u) = carry, row
         # The plant moves, in the present modes of its memories, and its nodes receive.
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
-        # Where nothing is ever missing, native code is told so.
+        # Measurements of which nothing is ever missing are marked, so that native code need not look for NaN.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
-        # What reports and messages between neighbours do; then all filters.
+        # Draw which reports and messages between neighbours arrive; then step all filters.
         drawn: dict[str, PyTree] = {
             name: by_report.uplinks.draw(key, k) for name, by_report in self.filters.reporting.items()
         }

@@ -1,1 +1,1 @@
-"""Models made of models: plants and sensors with further states, and sensors of several nodes as one."""
+"""Augmented models: plants and sensors with further states (biases, clocks, past outputs), and joint sensors."""

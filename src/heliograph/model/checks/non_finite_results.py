@@ -1,4 +1,4 @@
-"""Which function of a model returned what is no number, with the arguments for which it did."""
+"""Which function of a filter's model (f, Q, h, R) returned NaN or infinity, and for which arguments, in words."""
 
 from collections.abc import Iterator
 
@@ -43,7 +43,7 @@ def describe_non_finite_function(filter: PyTree, before: Estimate, u: Float[np.n
 
 
 def _yield_trial_states(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
-    """Yield the mean, and the states one deviation from it."""
+    """Yield the states at which functions are tried: the mean, and those one deviation from it."""
     mean = np.asarray(before.mean)
     variances = np.diag(np.asarray(before.covariance))
     yield mean

@@ -1,4 +1,4 @@
-"""Intervals of continuous time, divided by a row in between: what of a model goes by steps, and what is uneven."""
+"""Whether a row in between may split an interval of time: parts of a model, and predictions, that this would change."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def find_indivisible_part(
     channel: Channel | None = None,
     trigger: AbstractTrigger | None = None,
 ) -> str:
-    """Return which part has a law that a row in between would change, as one that goes from step to step; "" if none.
+    """Return the name of the part of a model whose law goes by steps, so that a row in between changes it; "" if none.
 
     Args:
         plant: the plant; each of these may be None, where it is not asked about.

@@ -1,4 +1,4 @@
-"""What a fusion between neighbours is made of: its nodes, its state, and what one of its steps consists of.
+"""Fusion between neighbours: its state, what a step computes without the estimates, and the formulas of a step.
 
 `n`: number of the plant's states; `m`: of the longest measurement; `degree`: most messages that a node receives, its
 own counted first.

@@ -171,30 +171,39 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
 
 
 def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
-    """Return the part of a fusion between neighbours that estimates at one node, from itself and its neighbours.
+    """Return the mesh of which one node estimates, from its own measurement and its neighbours' messages.
 
-    To it every message arrives; one that did not is a message of NaN. `fusion` and `node`: names.
+    No message gets lost in it: one that did not arrive is given to the filter as a message of NaN.
+
+    Args:
+        network: the network.
+        fusion: name of the fusion between neighbours.
+        node: name of the node.
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     neighbours = between.neighbours or {}
-    # The node's row of the graph: itself, then its neighbours.
+    # The node's row of the graph: itself, then its neighbours, numbered as the network numbers its nodes.
     graph = graph_of(neighbours, nodes)
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, senders=graph.senders[i : i + 1, :count], present=np.ones((1, count), dtype=bool))
+    only_node = np.zeros(1, dtype=int)  # the one node that estimates stands first among the members
+    # The members: the node and its neighbours. Each has a measurement model of its own, since they may differ in
+    # structure; None without a sensor.
     names = (node, *neighbours[node])
-    # A model of its own for each of them, since they may differ in structure; None without a sensor.
     members = [network.nodes[name] for name in names]
     models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in members]
     sizes = [n.received for n in members]
+    # Without groups of channels every message arrives; a step has one exchange.
+    lossless_edges = MeshEdges(groups=(), slots=np.zeros(0, dtype=int), present=row.present, rounds=1)
     return Mesh(
         plant=network.plant,
-        buckets=(NodeBucket(between.rule.placed(row), rows=np.zeros(1, dtype=int), width=count),),
-        ranks=np.zeros(1, dtype=int),
-        edges=MeshEdges((), np.zeros(0, dtype=int), row.present, 1),
+        buckets=(NodeBucket(rule=between.rule.placed(row), rows=only_node, width=count),),
+        ranks=only_node,
+        edges=lossless_edges,
         observation_model=SeparateObservations(
             tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count
         ),
-        senders=np.arange(count)[None],
+        senders=np.arange(count)[None],  # numbered among the members
         places=((0,),),
         nodes=names,
         alpha=None,

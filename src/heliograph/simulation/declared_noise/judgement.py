@@ -336,11 +336,11 @@ def _make_judgement(
     """
     before, after = tested
     place, judged_classes = declared.place, []
-    for number, (nis, nis_low, nis_high) in enumerate(before.nis):
+    for class_index, (nis, nis_low, nis_high) in enumerate(before.nis):
         # What each message of the class declares: one variance, the geometric mean over the outputs.
-        rows = declared.z[classes == number]
+        rows = declared.z[classes == class_index]
         variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
-        scale, scale_low, scale_high = (float(values[number]) for values in scales)
+        scale, scale_low, scale_high = (float(values[class_index]) for values in scales)
         judged_classes.append(
             DeclaredClass(
                 low=float(variances.min()),

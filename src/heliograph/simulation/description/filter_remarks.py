@@ -1,4 +1,4 @@
-"""What filters say happened to their states, such as that a gate gave in."""
+"""Remarks of filters on their own states after a run, such as that a gate gave in."""
 
 from collections.abc import Iterator
 

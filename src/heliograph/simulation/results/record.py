@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.disk.quoting import label_with_unit
 from heliograph.filters.innovation import InnovationSummary, Weighed
-from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.estimate import Estimate, mask_sound_estimates
 from heliograph.model.forecast_origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -190,7 +190,7 @@ class Record(SavableResults):
             ValueError: a recording has no truth, or there is no such filter.
         """
         errors, estimate, truth = self.errors(node, name), self.estimates[node][name], np.asarray(self.truth)
-        sound = is_sound(estimate)[..., None]
+        sound = mask_sound_estimates(estimate)[..., None]
         if estimate.claim == "none":
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
@@ -374,7 +374,10 @@ class Record(SavableResults):
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 what = "mean" if estimate.claim == "none" else "covariance"
-                lines += [f"{node}/{name}: no valid {what} {when}" for when in describe_bad_steps(~is_sound(estimate))]
+                lines += [
+                    f"{node}/{name}: no valid {what} {when}"
+                    for when in describe_bad_steps(~mask_sound_estimates(estimate))
+                ]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):

@@ -1,4 +1,4 @@
-"""Results by names of nodes and filters, from the axes of groups and kinds in which a network is computed."""
+"""Results by names of nodes and filters, from arrays whose axes are groups of nodes and kinds of filters."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

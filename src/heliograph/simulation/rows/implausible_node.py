@@ -1,4 +1,4 @@
-"""Which node a row's implausible values are of, where a central filter judges those of all nodes together."""
+"""Which node is to blame for an implausible row, where a central filter judges the values of all nodes together."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

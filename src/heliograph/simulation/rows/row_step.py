@@ -254,14 +254,16 @@ def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
 
 @lru_cache
 def _make_step(layout: RowLayout) -> Any:
-    """Return the function (numbers, row) -> (states, outputs), traced once for the outputs' layout, code and text.
+    """Return the compiled function (numbers, row) -> (states after the row, outputs) of networks of one structure.
 
-    `numbers`: the arrays of the network's step.
+    `numbers` are the arrays of a network's step: networks that differ in these alone share the function, and its trace
+    serves the layout of the outputs, the native code and the program's text.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        stepped: tuple[PyTree, PyTree] = layout.static.filled(numbers).step(*layout.split_row(row))
+        network_step = layout.static.filled(numbers)  # the structure with these arrays put back into it
+        stepped: tuple[PyTree, PyTree] = network_step.step(*layout.split_row(row))
         return stepped
 
     return jax.jit(step, inline=True)
