@@ -20,10 +20,13 @@ def test_what_is_beyond_does_not_count():
     z = np.array([[0.0, -50.0], [10.1, 5.0], [-999, np.nan], [np.nan, -1.0], [3.0, 5.1]])
     expected = [[False, False], [True, False], [True, False], [False, True], [False, True]]
     np.testing.assert_array_equal(limits.outside(z), expected)
-    assert limits.describe_missing(z[1], limits.judge_values(z[1]), ("near", "far")) == "near 10.1 is outside 0 to 10"
+    assert (
+        limits.describe_missing(z[1], limits.find_refusal_reasons(z[1]), ("near", "far"))
+        == "near 10.1 is outside 0 to 10"
+    )
     z = np.array([-999, 6.0])
     said = "near -999 is a code, far 6 is outside -inf to 5"
-    assert limits.describe_missing(z, limits.judge_values(z), ("near", "far")) == said
+    assert limits.describe_missing(z, limits.find_refusal_reasons(z), ("near", "far")) == said
     np.testing.assert_array_equal(limits_of(2, (-1, 1)).outside(np.array([1.0, 1.5])), [False, True])
 
 
@@ -117,4 +120,4 @@ def test_a_stream_with_limits_claims_nothing():
 def test_a_code_is_equal_in_the_type_in_which_it_came(value, code, same):
     limits, z = limits_of(1, None, code), np.array([value])
     assert limits.outside(z).tolist() == [same]
-    assert ("is a code" in limits.describe_missing(z, limits.judge_values(z), ["z"])) == same
+    assert ("is a code" in limits.describe_missing(z, limits.find_refusal_reasons(z), ["z"])) == same

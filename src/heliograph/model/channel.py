@@ -232,10 +232,12 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    return stack_channels_with_told_numbers(_make_as_late, separate_memories(check_maps("stack", [relayed, direct])))
+    return stack_channels_with_told_numbers(
+        _delay_all_like_latest, separate_memories(check_maps("stack", [relayed, direct]))
+    )
 
 
-def _make_as_late(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return links of one signal, each as late as the latest."""
     past = max(c.past for c in links)
     return [c if c.past == past else place_part(c, signal_size(c), 0, past) for c in links]
@@ -250,10 +252,12 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    return stack_channels_with_told_numbers(_place_links, separate_memories(check_maps("parallel channels", channels)))
+    return stack_channels_with_told_numbers(
+        _select_part_for_each_link, separate_memories(check_maps("parallel channels", channels))
+    )
 
 
-def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
     total, past = sum(signal_size(link) for link in links), max(link.past for link in links)
     placed = []
@@ -281,13 +285,13 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
             flags or time stamps, which would be added up.
     """
     separate = separate_memories(check_maps("links of a sum", links))
-    return build_with_told_numbers(partial(_add_links, noise=noise, same=same), separate)
+    return build_with_told_numbers(partial(_add_up_links, noise=noise, same=same), separate)
 
 
-def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
+def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
     """Check links without what is told of them, place each on the signal, and add them up."""
     for i, link in enumerate(links, 1):
-        _check_added(f"link {i} of a sum", link)
+        _check_can_be_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]
     if len(set(sizes)) > 1:
         raise fail("links of a sum", "links of one number of outputs", sizes)
@@ -302,7 +306,7 @@ def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
     return Superposed(links, as_noise("noise of a sum", noise, sizes[0]), places, (1 + past) * total)
 
 
-def _check_added(name: str, link: AbstractRandomAffine) -> None:
+def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:
     """Raise ValueError where a link delivers what cannot be added up."""
     inside = [link, *all_inner_maps(link)]
     if any(isinstance(m, ModeOutput) or (isinstance(m, Delayed) and m.timestamped) for m in inside):

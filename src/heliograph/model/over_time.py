@@ -150,7 +150,7 @@ def list_models_by_step(model: PyTree, count: int) -> list[PyTree]:
     return unstack(model)[:count] if isinstance(model, OverTime) else [model] * count
 
 
-def stacked(model: PyTree) -> PyTree:
+def stack_over_time(model: PyTree) -> PyTree:
     """Return what varies over time as one object whose arrays have a first axis of time; another as it is."""
     return model.values if isinstance(model, OverTime) else model
 

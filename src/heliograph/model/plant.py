@@ -112,7 +112,7 @@ class AbstractPlant(Module):
         """Return the state x (..., n) with its angles within half a turn of those of `other`, so that they average."""
         return self.manifold.near(x, other)
 
-    def moves(
+    def make_motion_about(
         self, u: jax.Array, center: jax.Array, middle: jax.Array | None = None
     ) -> Callable[[jax.Array], jax.Array]:
         """Return x -> f(x, u) as moments are made of it, about `center` and the state `middle` after the step.

@@ -111,7 +111,7 @@ class ReadingLimits(Module):
 
         What is beyond limits or a code is no reading, and ends no run.
         """
-        refused = self.judge_values(z)
+        refused = self.find_refusal_reasons(z)
         values = np.where(refused > 0, np.nan, z)
         if self.stuck is None:
             return ScreenedReadings(values, refused, before)
@@ -120,7 +120,7 @@ class ReadingLimits(Module):
         refused = np.where(stuck, number_of_reason("stuck"), refused)
         return ScreenedReadings(np.where(stuck, np.nan, values), refused, repeats)
 
-    def judge_values(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
+    def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
         """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.
 
         A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits. NaN
@@ -133,7 +133,7 @@ class ReadingLimits(Module):
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
         """Return True for each number that by itself counts as missing; NaN is not one of them."""
-        return np.asarray(self.judge_values(z) > 0)
+        return np.asarray(self.find_refusal_reasons(z) > 0)
 
     def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
         """Describe in words the components of a measurement that are refused; "" if there are none.

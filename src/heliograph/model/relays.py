@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import at, first, stacked, steps_covered
+from heliograph.model.over_time import at, first, stack_over_time, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
@@ -226,7 +226,7 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
 
 def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """Return one array of a plant or sensor for each step."""
-    value = np.asarray(read(stacked(model)), dtype=np.float64)
+    value = np.asarray(read(stack_over_time(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]
     return np.broadcast_to(value, (horizon, *value.shape))

@@ -22,7 +22,7 @@ from heliograph.simulation.description.angle_doubts import doubt_angles_beyond_a
 from heliograph.simulation.description.doubtful_estimates import doubt_estimates
 from heliograph.simulation.description.filter_remarks import describe_remarks
 from heliograph.simulation.implausible_data import (
-    FilterJudges,
+    JudgementReader,
     any_implausible,
     describe_doubts,
     find_refused_rows,
@@ -307,7 +307,7 @@ def _find_refused_rows(
     if centrally:
         states = find_central_states_before_rows(task, grouped)
         in_order = {name: z[name] for name in network.names}
-        nodes = FilterJudges(network).without_own
+        nodes = JudgementReader(network).without_own
         refused |= blame_nodes_for_implausible_rows(filters.central, states, in_order, u, centrally, nodes)
     new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
     return {name: rows for name, rows in new.items() if rows}

@@ -35,7 +35,7 @@ def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
     return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
 
 
-def read_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+def read_refusal_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """Return each filter's reason not to use its measurement, 0 for none: of nodes by kind, of central ones by name."""
     by_kind = [judgement.reason for judgement in outputs["judged"]]
     return by_kind, {name: judgement.reason for name, judgement in outputs["judged_centrally"].items()}
@@ -82,7 +82,7 @@ def step_plausibly(
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
         """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
         turn, (_, before) = carry
-        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_reasons(before))
+        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_refusal_reasons(before))
         # The first turn judges all data, the second what is left of them: the first's judgements stay.
         for name in ("judged", "judged_centrally"):
             outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
@@ -94,7 +94,7 @@ def step_plausibly(
     return stepped
 
 
-class FilterJudges:
+class JudgementReader:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
@@ -145,16 +145,16 @@ def find_refused_rows(
     Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
     what filtering the rows with judgements put out.
     """
-    judges, refused = FilterJudges(network), dict[str, dict[int, str]]()
+    judges, refused = JudgementReader(network), dict[str, dict[int, str]]()
     without_own = judges.without_own
     for name in network.names:
-        if name not in without_own and (reasons_by_row := _list_reasons(judges.read_node(outcome, name))):
+        if name not in without_own and (reasons_by_row := _list_rows_refused_by_all(judges.read_node(outcome, name))):
             refused[name] = reasons_by_row
-    central = _list_reasons(judges.read_node(outcome, without_own[0])) if without_own else {}
+    central = _list_rows_refused_by_all(judges.read_node(outcome, without_own[0])) if without_own else {}
     return refused, central
 
 
-def _list_reasons(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
+def _list_rows_refused_by_all(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
     """Return the rows whose values all these filters refuse, with the reason."""
     reasons_by_row = {row: Judgement.why_values(votes[row]) for row in _find_flagged(votes, "reason")}
     return {row: reason for row, reason in reasons_by_row.items() if reason}
@@ -198,7 +198,7 @@ def describe_doubts(
             lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
     # Inputs, judged by all filters.
     if network.inputs:
-        votes = FilterJudges(network).read_all(outputs)
+        votes = JudgementReader(network).read_all(outputs)
         rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
         if rows:
             lines.append(f"inputs: {_format_rows(rows)} implausible: {INPUT}")

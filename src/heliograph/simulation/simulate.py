@@ -115,7 +115,7 @@ def monte_carlo(
                 network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision
             )
         if by_native_code is not None:
-            return _warn_of_invalid_numbers(by_native_code, network)
+            return _return_with_warnings(by_native_code, network)
     # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
     planned = precompute_filters(filters, u) if can_precompute(filters) else filters
@@ -132,7 +132,7 @@ def monte_carlo(
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
-    return _warn_of_invalid_numbers(finish_result(reducer, recorded, network, smoothing), network)
+    return _return_with_warnings(finish_result(reducer, recorded, network, smoothing), network)
 
 
 def _has_long_step(network: "Network") -> bool:
@@ -140,7 +140,7 @@ def _has_long_step(network: "Network") -> bool:
     return any(mesh.has_long_step for mesh in build_meshes(network).values())
 
 
-def _warn_of_invalid_numbers(result: Result, network: Network) -> Result:
+def _return_with_warnings(result: Result, network: Network) -> Result:
     """Return the result as it is; warn where a record holds what is no number, or a state beyond its limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)

@@ -86,12 +86,12 @@ class World(Module):
             "truth": x,
             "measurements": z,
             "transmissions": self.medium.reasons(medium),
-            **_turn_to_truth(plant, x, outputs),
+            **_turn_angles_to_truth(plant, x, outputs),
         }
         return after, results
 
 
-def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
+def _turn_angles_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
     """Return the estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
         return outputs

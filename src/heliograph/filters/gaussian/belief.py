@@ -144,10 +144,10 @@ def transform_about_mean(
     """
     # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
-    image = transform.image(plant.moves(u, x.mean, middle), x)
+    image = transform.image(plant.make_motion_about(u, x.mean, middle), x)
     for _ in range(MEAN_STEPS if plant.attitude and not transform.keeps_center else 0):
         middle = plant.manifold.settle(middle, image.mean)
-        image = transform.image(plant.moves(u, x.mean, middle), x)
+        image = transform.image(plant.make_motion_about(u, x.mean, middle), x)
     return middle, image
 
 

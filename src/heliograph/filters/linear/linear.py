@@ -30,7 +30,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.markov_jump_models import list_mode_models
-from heliograph.model.over_time import OverTime, at, first, stacked
+from heliograph.model.over_time import OverTime, at, first, stack_over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
@@ -113,7 +113,7 @@ class LinearFilter(AbstractSizedFilter):
     @property
     def has_known_gain(self) -> bool:
         """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
-        whole = stacked(self.channel)
+        whole = stack_over_time(self.channel)
         return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
 
     def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
@@ -232,7 +232,7 @@ def linear_filter(
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
-    whole = stacked(described)
+    whole = stack_over_time(described)
     start = first(plant)
     return LinearFilter(
         plant=plant,

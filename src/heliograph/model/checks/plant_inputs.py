@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.model.input_dependent_sensor import NoiseOfInputs
 from heliograph.model.markov_jump_models import list_mode_models
-from heliograph.model.over_time import at, first, stacked
+from heliograph.model.over_time import at, first, stack_over_time
 from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, matrix_under_inputs
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
@@ -133,7 +133,7 @@ def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
 
     def is_part(part: object) -> bool:
         """Return whether an object is of the class, constant or over time."""
-        return isinstance(stacked(part), kind)
+        return isinstance(stack_over_time(part), kind)
 
     yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
 

@@ -89,7 +89,7 @@ def _predict_over_intervals(
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
-            a, moved = jax.jacfwd(plant.moves(u, state))(state), plant.transition(state, u)
+            a, moved = jax.jacfwd(plant.make_motion_about(u, state))(state), plant.transition(state, u)
             state = plant.manifold.settle(moved, moved + plant.noise_mean())
             matrix, spread = a @ matrix, a @ spread @ a.T + plant.noise_covariance(u)
         return state, matrix, spread

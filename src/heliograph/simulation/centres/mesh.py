@@ -137,7 +137,7 @@ class Mesh(Module):
         measured = jnp.concatenate([self._pad_to_longest(rows) for rows in z])[self.observation_model.order]
         present = ~jnp.isnan(measured)
         # Where messages may be late or quantized: which estimates arrive, and measurements with those sent just now.
-        messages = self._keep_messages(state, jnp.asarray(arrived))
+        messages = self._gather_late_or_quantized(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         # Weights and gains, none of which depends on the estimates.
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
@@ -180,10 +180,10 @@ class Mesh(Module):
         Computed as sum_j H_j' R_j^-1 (z_j - offset_j - H_j m) - S (xb - m), `weighted` the terms of the sum, about one
         m for all nodes, `common`: so no digits of large means are lost.
         """
-        sums = self._collect_sums(weighted, arrived)
+        sums = self._sum_over_reached_nodes(weighted, arrived)
         return sums - jnp.einsum("iab,ib->ia", step.information, predicted - common)
 
-    def _keep_messages(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
+    def _gather_late_or_quantized(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
         """Return the estimates that arrive where they may be late or quantized; None where they come as they are now.
 
         `arrived`: flags, or ages where messages may be late, (node, rounds, degree).
@@ -247,7 +247,7 @@ class Mesh(Module):
             covariance = jnp.asarray(exchanges[-1].covariance)
         # Information that reaches each node from the measurements, and all that its neighbours could have measured.
         data = compute_information(self.observation_model.observe(*after, jnp.asarray(k)), measured)
-        information = self._collect_sums(data.information, arrived)
+        information = self._sum_over_reached_nodes(data.information, arrived)
         complete = self.sum_over_messages(data.complete, jnp.asarray(self.edges.present))
         # The last round fuses, predicts and corrects; late estimates are rows of their own beside the nodes'.
         arrives, senders = arrived[:, -1], None
@@ -313,7 +313,7 @@ class Mesh(Module):
         padded = [r._replace(parts=_pad_to_degree(r.parts, self.senders.shape[1])) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
-    def _collect_sums(self, values: jax.Array, arrived: Arrived) -> jax.Array:
+    def _sum_over_reached_nodes(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of all nodes that reach it in any round, each once."""
         if self.edges.rounds == 1:
             return self.sum_over_messages(values, jnp.asarray(arrived[:, 0]))

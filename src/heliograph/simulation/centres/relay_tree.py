@@ -128,7 +128,7 @@ def relay_tree(
         errors = _join_blocks_of_relays(relays)
         while len(errors.independent) > 1:
             level_covariances.append(np.asarray(errors.covariances()))
-            relay_weights, errors = _climb_level(errors, degree)
+            relay_weights, errors = _fuse_level_of_relays(errors, degree)
             level_weights.append(relay_weights)
         level_covariances.append(np.asarray(errors.covariances()))
     return RelayTree(
@@ -219,7 +219,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     return factors.errors
 
 
-def _climb_level(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
+def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
     """Return the weights (relay, n, child, n) and the errors of the relays above nodes with these errors."""
     groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
