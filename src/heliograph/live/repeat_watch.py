@@ -30,9 +30,10 @@ class RepeatWatch:
     A reading of resolution q equals the one before with probability at most p(q), whatever the sensor measures
     (`bound_probability_of_equal_readings`), and p grows with q. Where no resolution is declared, the least difference
     of two successive readings so far is a multiple of q, so that its p is a bound too; where all were equal that is 1,
-    and nothing is found. A law may be stated too large, or repeat values by itself: p is at least (e + 1) / (o + 2), where
-    e of the o pairs of successive readings outside of the run were equal. A run of n readings begins at a reading with
-    probability at most p^(n - 1), and is found where that is at most SELDOM: one by chance is at most so rare.
+    and nothing is found. A law may be stated too large, or repeat values by itself: p is at least (e + 1) / (o + 2),
+    where e of the o pairs of successive readings outside of the run were equal. A run of n readings begins at a
+    reading with probability at most p^(n - 1), and is found where that is at most SELDOM: one by chance is at most so
+    rare.
 
     Args:
         noises: laws of the sensor's noise, one for each that it has over time.
