@@ -79,10 +79,14 @@ def examine_innovations(
 
 
 def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
-    """Return the correlation over one message, and the p-value of those over up to ten.
+    """Return the correlation r_1 of innovations one message apart, and the p-value of r_1, ..., r_10 together.
 
-    r_l = sum_k u_k u_k-l / sum_k u_k^2. `exact`: innovations are independent if their claim is true. Then Ljung and
-    Box's sum of the r_l^2 is chi-squared; else each r_l is taken in units of an error estimated for it.
+    r_l = sum_k u_k u_(k-l) / sum_k u_k^2. Without memory the sum over l of the squares, each in units of its variance,
+    is chi-squared. The variance is that of Ljung and Box where innovations are independent, else estimated.
+
+    Args:
+        white: innovations u in units of their claimed deviation, NaN where none is; of few rows fewer lags are tested.
+        exact: whether innovations are independent if their claim is true.
     """
     rows, count = len(white), int(np.sum(~np.isnan(white)))
     lags = min(LAGS, rows // 10)
@@ -94,4 +98,5 @@ def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[
     else:
         sums = [average_correlated(np.nansum(product, axis=1)) for product in products]
         squared = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
-    return float(r[0]), float(scipy.special.gammaincc(lags / 2, np.sum(squared) / 2))
+    p_value = scipy.special.gammaincc(lags / 2, np.sum(squared) / 2)  # upper tail of chi-squared, `lags` degrees
+    return float(r[0]), float(p_value)
