@@ -244,7 +244,7 @@ def markov_plant(
     name: str | None = None,
     modes: "AbstractWithMemory | None" = None,
     rates: "ArrayLike | None" = None,
-) -> ModalPlant:
+) -> "ModalPlant":
     """Return a plant whose law of motion is that of the mode of a Markov chain: straight or turning, intact or worn.
 
     x_k = f_r(x_(k-1), u_k) + w_r with r the mode of step k, r_1 ~ `initial`, r_(k+1) ~ transition[r_k, .]. The mode of

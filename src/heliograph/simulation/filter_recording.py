@@ -99,8 +99,7 @@ def run(
     instance("network", network, Network, "a Network")
     example = f"arrays of nodes, such as {{{next(iter(network.nodes))!r}: z}},"
     measured = table("measurements", measurements, example)
-    network = network.restricted_to(measured)
-    steps = _count_rows(next(iter(measured.values())))
+    network, steps = network.restricted_to(measured), _count_rows(next(iter(measured.values())))
     # Measurements, filters, and where they go on behind earlier rows.
     z = {name: read_measurements(name, measurements[name], steps, node) for name, node in network.nodes.items()}
     smoothing = None if smooth is None else select_smoothed_part(network, smooth, steps)
@@ -124,18 +123,15 @@ def run(
     with jax.enable_x64(True):
         arrivals = _collect_arrivals(filters, {} if reports is None else reports, steps)
         smoother = None if smoothing is None else smoothing.smoother(filters)
-        outputs = _filter_without_implausible_data(
-            network, z, refused, FilteringTask(filters, smoother, u, arrivals, begin)
-        )
+        task = FilteringTask(filters, smoother, u, arrivals, begin)
+        outputs = _filter_without_implausible_data(network, z, refused, task)
     state = outputs.pop("state")
     record = _make_record(network, smoothing, outputs, clock)
-    if time is not None and (unit := units_in(network.inputs).get(TIME_STEP)):
-        record = replace(record, units=record.units | {"time": unit})
+    record = record if time is None else _add_unit_of_time(record, network.inputs)
     _warn_of_record(network, record, state)
     # Where the rows end, for forecasts and later rows. Rows without times are all as far apart as the first two.
-    origin = _make_forecast_origin(
-        network, record, state, u, find_median_spacing(clock if times is not None else clock[:2])
-    )
+    spacing = find_median_spacing(clock if times is not None else clock[:2])
+    origin = _make_forecast_origin(network, record, state, u, spacing)
     record = record if true is None else add_truth(record, network.plant, true, smooth)
     return record.with_origin(replace(origin, step=first + steps, repeats=repeats)).with_refused(refused)
 
@@ -158,6 +154,12 @@ def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyT
     if smoothing is None:
         return trajectories_record(network, {"truth": None, **outputs}, clock)
     return make_smoothed_record(network, smoothing, outputs, clock)
+
+
+def _add_unit_of_time(record: Record, inputs: Sequence[str]) -> Record:
+    """Return the record with the unit of its times, which is that of the plant's time step, where this has one."""
+    unit = units_in(inputs).get(TIME_STEP)
+    return replace(record, units=record.units | {"time": unit}) if unit else record
 
 
 def _warn_of_each(lines: Sequence[str]) -> None:
