@@ -29,7 +29,7 @@ from heliograph.simulation.implausible_data import (
 )
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import AllFilters
-from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
+from heliograph.simulation.results.non_finite_warnings import warn_of_non_finite_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import trajectories_record
 from heliograph.simulation.rows.implausible_node import blame_nodes_for_implausible_rows
@@ -141,7 +141,7 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
 
     `state`: of all filters after the last row.
     """
-    warn_of_no_numbers(record)
+    warn_of_non_finite_numbers(record)
     doubts = *doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)
     _warn_of_each((*doubts, *_describe_left_out(network, record), *describe_remarks(network, state)))
 

@@ -25,7 +25,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
 from heliograph.simulation.precomputed_filters import can_precompute, precompute_filters
-from heliograph.simulation.results.non_finite_warnings import warn_of_no_numbers
+from heliograph.simulation.results.non_finite_warnings import warn_of_non_finite_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
@@ -145,7 +145,7 @@ def _return_with_warnings(result: Result, network: Network) -> Result:
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
-        warn_of_no_numbers(result, complete, stacklevel=4)
+        warn_of_non_finite_numbers(result, complete, stacklevel=4)
     return result
 
 

@@ -92,7 +92,7 @@ def list_axes(name: str, lead: Sequence[str]) -> list[str]:
     return [axis for part in FIELDS[name].axes.split() for axis in (lead if part == "..." else [part])]
 
 
-def check_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
+def select_given_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
     """Return units by the state's name, and of "time", without those that are empty; raise where one does not fit.
 
     Raises:

@@ -10,7 +10,7 @@ from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.record import Record, describe_bad_steps
 
 
-def warn_of_no_numbers(record: Record, complete: Iterable[str] = (), stacklevel: int = 3) -> None:
+def warn_of_non_finite_numbers(record: Record, complete: Iterable[str] = (), stacklevel: int = 3) -> None:
     """Warn of estimates, and of what was simulated, that are no finite numbers from some step on, a line each.
 
     Covariances are not judged here, which of many runs takes long; `Record.failures` does.

@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.disk.quoting import quote_for_file, unquote_file
 from heliograph.disk.whole_file import check_replaceable, check_writable, whole_file, whole_folder
 from heliograph.numerics.check import fail, file_path
-from heliograph.simulation.results.labelled_datasets import check_units
+from heliograph.simulation.results.labelled_datasets import select_given_units
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr
@@ -36,7 +36,7 @@ class SavableResults:
         """
         smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
         changed = copy(self)
-        vars(changed).update(units=check_units(units, self.states), smoothed=smoothed)
+        vars(changed).update(units=select_given_units(units, self.states), smoothed=smoothed)
         return changed
 
     def to_xarray(self) -> "xr.Dataset":

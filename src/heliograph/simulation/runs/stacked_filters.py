@@ -66,13 +66,13 @@ def filter_step(
     if smooths:
         if judges:
             *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)
-            weighed = get_weighed(innovation)
+            weighed = get_weighed_components(innovation)
         after, steps = filter.step_with_smoother(state, z, u, k)
         return after, StepOutput(filter.after_step(after, k), steps, judgement, weighed)
     # With a judgement, or alone.
     if judges:
         after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
-        weighed = get_weighed(innovation)
+        weighed = get_weighed_components(innovation)
     else:
         after, estimate = filter.step(state, z, u, k)
     # A prediction that is no number leaves the state as it was.
@@ -82,7 +82,7 @@ def filter_step(
     return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
 
 
-def get_weighed(innovation: Innovation) -> Weighed | None:
+def get_weighed_components(innovation: Innovation) -> Weighed | None:
     """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others."""
     if innovation.weight is None:
         return None
