@@ -184,7 +184,7 @@ def test_forecasts_are_rows_behind_the_data_and_a_part_of_the_page(tmp_path, cap
     (tmp_path / "data.csv").write_text(f"time,flow,height\n{rows}")
     call = ["run", str(tmp_path / "level.py"), "--measurements", str(tmp_path / "data.csv"), "--forecast", "3"]
     assert cli.main([*call, "--out", str(tmp_path / "out.csv"), "--report", str(tmp_path / "report")]) == 0
-    assert "forecast: 3 rows behind the data, to 32.0, inputs held at those of the last row" in capsys.readouterr().out
+    assert "forecast: 3 rows beyond the data, to 32, inputs held at those of the last row" in capsys.readouterr().out
     written = (tmp_path / "out.csv").read_text().splitlines()
     assert [line.split(",")[1] for line in written[-4:]] == ["0", "1", "1", "1"]
     assert "Inputs are held at those of the last row." in (tmp_path / "report" / "report.html").read_text()

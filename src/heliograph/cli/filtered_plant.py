@@ -173,9 +173,12 @@ def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
 
 def _describe_forecasts(forecasts: "ByFilter") -> str:
     """Return a line on how far forecasts go, and with which inputs."""
+    from heliograph.numerics.times.dates import format_times
+
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
     held = "" if any_forecast.inputs == "none" else ", inputs held at those of the last row"
-    return f"forecast: {len(any_forecast.steps)} rows behind the data, to {any_forecast.time[-1]}{held}"
+    (last,) = format_times(any_forecast.time[-1:])
+    return f"forecast: {len(any_forecast.steps)} rows beyond the data, to {last}{held}"
 
 
 def _select_rows_of_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":

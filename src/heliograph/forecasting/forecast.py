@@ -195,7 +195,7 @@ def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) ->
     last = int(np.max(step))
     if filter.horizon is not None and last + count > filter.horizon:
         left = max(filter.horizon - last, 0)
-        raise fail("horizons", f"at most {left} steps, which the model covers behind the data", count)
+        raise fail("horizons", f"at most {left} steps, which the model covers beyond the data", count)
 
 
 def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -> Forecast:

@@ -60,7 +60,7 @@ def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, in
         inputs: those of the rows ahead but dt; "held" for those of the last row; None of a plant without others.
 
     Raises:
-        ValueError: a horizon that is not behind the one before, or behind the data; inputs that are not those of the
+        ValueError: a horizon that is not after the one before, or not after the data; inputs that are not those of the
             rows, none of a plant that has some, or none to hold.
     """
     is_continuous = TIME_STEP in names

@@ -260,7 +260,7 @@ class Timeline:
         by_steps, rows = self._program.dt is None, self._plant.rows
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
         if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
-            raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
+            raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:.12g}")
         # Slots of the row before that moment, of the moment itself, and of all later rows. Where no step has a row at
         # the moment, the spare slot takes a prediction to it.
         after = rows.first_after(time)

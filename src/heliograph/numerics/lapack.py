@@ -32,7 +32,8 @@ def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
     deviation = xp.sqrt(xp.maximum(xp.diagonal(a), 0.0))
     scale = xp.where(deviation > 0, 1 / xp.where(deviation > 0, deviation, 1.0), 0.0)  # 1 / deviation, 0 for rows of 0
     # A^+ = D V L^+ V' D of the correlation matrix D A D = V L V', D the scale.
-    values, vectors = (np.linalg.eigh if xp is np else eigh)(scale[:, None] * a * scale)
+    correlation = scale[:, None] * a * scale
+    values, vectors = np.linalg.eigh(correlation) if xp is np else eigh(correlation)
     used = values > tolerance * values[-1]
     scaled_vectors = scale[:, None] * vectors
     solution: A = (scaled_vectors * xp.where(used, 1 / xp.where(used, values, 1.0), 0.0)) @ (scaled_vectors.T @ b)

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from heliograph.disk.quoting import visible
+from heliograph.numerics.times.dates import format_times
 from heliograph.report.figures import COLOURS, MUTED
 from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Table, Text
@@ -79,7 +80,7 @@ def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])
-    headers, columns = ["time"], [[_format_time(forecast.time[row]) for row in rows]]
+    headers, columns = ["time"], [format_times(forecast.time[rows])]
     for kind, prediction in predictions:
         claims = prediction.claim != "none"
         low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
@@ -96,8 +97,3 @@ def _format_mean_and_interval(mean: float, low: float, high: float, deviation: f
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"
-
-
-def _format_time(time: np.generic) -> str:
-    """Return a time as text: a date to the second, else a number."""
-    return str(time)[:19] if isinstance(time, np.datetime64) else f"{time:g}"

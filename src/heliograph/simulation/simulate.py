@@ -38,6 +38,7 @@ from heliograph.simulation.runs.lanes import (
     count_runs_by_batch,
     has_processor_alone,
     is_shared,
+    split_into_chunks,
 )
 from heliograph.simulation.runs.memory import NeededMemory, check_memory, count_bytes, explain_out_of_memory
 from heliograph.simulation.runs.native import simulate_natively
@@ -210,7 +211,8 @@ def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, prog
             first_run,
             one_by_one=bool(job.world.filters.meshes),  # weights are solved for many estimates at once
         )
-        parts = advance_in_chunks(lanes.advance, lanes.count, wide=lanes.wide, runs=(runs, chunk), progress=progress)
+        chunks = split_into_chunks(lanes.count, lanes.wide, runs, chunk)
+        parts = advance_in_chunks(lanes.advance, chunks, runs, progress)
     collected = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:runs], *parts)  # without padding
     # Sums, and for each whether it is a value that all runs share.
     total = lanes.total()

@@ -60,6 +60,20 @@ def test_a_long_record_is_thinned_and_odd_ones_are_shown():
     assert "3 rows of 2 runs, the first drawn" in runs._repr_html_() and "truth" in runs._repr_html_()
 
 
+@pytest.mark.parametrize(
+    ("start", "step", "ends"),
+    [
+        (0.0, 0.1, ("21", "21.2")),  # 21.200000000000003 in double precision
+        (1.7e9, 0.1, ("1700000021", "1700000021.2")),  # since 1970: not "1.7e+09" twice
+        (TIMES[0], np.timedelta64(100, "ms"), ("2026-11-29T10:00:21.000", "2026-11-29T10:00:21.200")),
+        (TIMES[0], np.timedelta64(1, "s"), ("2026-11-29T10:03:30", "2026-11-29T10:03:32")),
+    ],
+)
+def test_times_as_texts_differ_where_the_times_do(start, step, ends):
+    shown = record(3, start + np.arange(210, 213) * step)._repr_html_()
+    assert tuple(re.findall(r"<span>([^<]*)</span>", shown)[-2:]) == ends
+
+
 @pytest.mark.real("browser")
 def test_it_fits_a_window(fits):
     """In a browser at 1200 and 420 pixels, where there is one."""

@@ -167,6 +167,19 @@ def format_dates(time: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))
 
 
+DIGITS = 12  # of a number of seconds: .1 us since 1970's
+
+
+def format_times(time: np.ndarray) -> list[str]:
+    """Return times as texts for people: dates with as many digits of a second as one of them needs, else numbers.
+
+    A number has up to twelve digits, so that the times of rows since 1970 differ, and 21.200000000000003 is 21.2.
+    """
+    if time.dtype.kind == "M":
+        return [text.removesuffix("Z") for text in format_dates(time).tolist()]
+    return [f"{moment:.{DIGITS}g}" for moment in time.tolist()]
+
+
 SPAN = re.compile(r"(?P<count>\d+(?:[.]\d+)?(?:e[+-]?\d+)?)\s*(?P<unit>ns|us|ms|s|min|h|d|w)")
 NANOSECONDS = {
     "s": 10**9,

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import visible
 from heliograph.numerics.check import instance
+from heliograph.numerics.times.dates import format_times
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
 from heliograph.report.forecasts import draw_forecasts, forecast_tables
 from heliograph.report.health import Health
@@ -307,10 +308,10 @@ def _count_in_words(count: int, what: str) -> str:
 
 def _describe_span(record: Record) -> str:
     """Return the times that the recording covers as text, such as "from 0 to 10 s"."""
-    time, unit = record.time, record.units.get("time", "")
-    if time.dtype.kind == "M":
-        return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
-    return f"from {time[0]:g} to {time[-1]:g} {unit}".rstrip()
+    first, last = format_times(record.time[[0, -1]])
+    if record.time.dtype.kind == "M":
+        return f"{first} to {last} UTC"
+    return f"from {first} to {last} {record.units.get('time', '')}".rstrip()
 
 
 def _list_doubts(doubts: list[str]) -> list[Points | Text]:

@@ -278,8 +278,9 @@ def _classify_rows(
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
     numbers = int(np.sum(~np.isnan(z[heard][:, place.values])))
     classes = min(CLASSES, len(np.unique(log_size[heard])), max(numbers // EACH, 1))
-    inner = np.quantile(log_size[heard], np.arange(1, classes) / classes, method="lower") if heard.any() else []
-    edges = np.array([edge for edge in np.unique(inner) if edge < log_size[heard].max()])
+    sizes, shares = log_size[heard], np.arange(1, classes) / max(classes, 1)
+    inner = np.quantile(sizes, shares, method="lower") if heard.any() else np.empty(0)
+    edges = np.array([edge for edge in np.unique(inner) if edge < sizes.max()])
     # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
     outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])

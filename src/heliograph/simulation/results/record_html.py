@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.disk.palette import COLOURS
 from heliograph.disk.quoting import label_with_unit, visible
 from heliograph.model.estimate import Estimate
+from heliograph.numerics.times.dates import format_times
 
 PANELS, FILTERS, POINTS = 6, 4, 500  # drawn at most: states, filters of a node, and rows of them
 SIGMAS = 2.0  # half-width of bands in claimed deviations
@@ -72,7 +73,7 @@ def write_record_html(record: DrawableRecord) -> str:
     notes += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
     # A panel for each state, and the first and last time below.
     panels = [_write_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
-    times = "".join(f"<span>{escape(_format_time(record.time[k]))}</span>" for k in (0, -1))
+    times = "".join(f"<span>{escape(time)}</span>" for time in format_times(record.time[[0, -1]]))
     note = f"<div>{escape('; '.join(notes))}</div>" if notes else ""
     return (
         '<div style="max-width:640px;font-size:13px;line-height:1.4">'
@@ -184,8 +185,3 @@ def _yield_band_paths(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):
         ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
         yield f"M{'L'.join(ends)}Z"
-
-
-def _format_time(time: np.generic) -> str:
-    """Return a date to the second, or a number, as text."""
-    return np.datetime_as_string(time, "s") if isinstance(time, np.datetime64) else f"{float(time):g}"

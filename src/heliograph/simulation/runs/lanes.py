@@ -130,29 +130,39 @@ def add_sums(total: PyTree, more: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: b if is_shared(b) else a + b, total, more, is_leaf=is_shared)
 
 
+def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[range]:
+    """Split runs into chunks of at most about `chunk` runs: return the numbers of the blocks of each.
+
+    A chunk has fewer blocks than there are lanes, or a multiple of their number; the last may go beyond the runs.
+
+    Args:
+        lanes: their number.
+        wide: always a multiple of it.
+        runs: how many there are.
+        chunk: how many a chunk should have.
+    """
+    blocks = -(-min(chunk, runs) // BLOCK)  # of a chunk, rounded up
+    if blocks >= lanes or wide:
+        blocks = lanes * -(-blocks // lanes)
+    return [range(start, start + blocks) for start in range(0, -(-runs // BLOCK), blocks)]
+
+
 def advance_in_chunks(
-    advance: Callable[[int, int], PyTree], lanes: int, wide: bool, runs: tuple[int, int], progress: Progress | None
+    advance: Callable[[int, int], PyTree], chunks: list[range], runs: int, progress: Progress | None
 ) -> list[PyTree]:
     """Advance over all blocks, chunk by chunk, with progress between; return what each chunk collected.
 
-    A chunk has fewer blocks than there are lanes, or a multiple of their number.
-
     Args:
         advance: over (number of the first block, count of blocks); returns what is collected.
-        lanes: their number.
-        wide: always a multiple of it.
-        runs: how many there are, and how many a chunk has.
+        chunks: what `split_into_chunks` returned of the runs.
+        runs: how many there are.
         progress: is called with how many runs are done, and of how many.
     """
-    count, chunk = runs
-    blocks = -(-min(chunk, count) // BLOCK)  # of a chunk, rounded up
-    if blocks >= lanes or wide:
-        blocks = lanes * -(-blocks // lanes)
     parts = []
-    for start in range(0, -(-count // BLOCK), blocks):
-        parts.append(advance(start, blocks))
+    for blocks in chunks:
+        parts.append(advance(blocks.start, len(blocks)))
         if progress is not None:
-            progress(min((start + blocks) * BLOCK, count), count)
+            progress(min(blocks.stop * BLOCK, runs), runs)
     return parts
 
 

@@ -22,12 +22,12 @@ from heliograph.simulation.arguments import Precision
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.lanes import LANES, Progress, advance_in_chunks
+from heliograph.simulation.runs.lanes import LANES, Progress
 from heliograph.simulation.runs.memory import NeededMemory, check_memory
-from heliograph.simulation.runs.native_lanes import NativeLanes, NativeProgram
+from heliograph.simulation.runs.native_lanes import NativeProgram, NativeRuns
 from heliograph.simulation.runs.node_parts import NODES, build_world, count_parts, is_apart, split_nodes
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, SmoothingPlan, finish_result, reduce_run
+from heliograph.simulation.smoothed import NetworkSmoother, SmoothingPlan, finish_result, reduce_run
 from straightline import Unsupported, accumulate
 
 PROGRAMS = 64  # whose code is held at once
@@ -92,6 +92,8 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
     lanes = min(LANES, -(-runs // BLOCK))
     collected, sums, variables = code.begun.program.measure_memory(runs, lanes, min(lanes, os.cpu_count() or 1))
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
+    # While the sums of a part are added up, the next part is computed.
+    sums *= min(parts, 2)
     check_memory(NeededMemory(parts * collected, sums, variables), runs, horizon)
 
 
@@ -316,7 +318,8 @@ def simulate_natively(
     if code is None:
         return None
     check_memory_of_parts(code, 1, runs, len(inputs), precision)
-    return finish_result(reducer, _run_chunks(code, first_run, runs, chunk, progress), network, smoothing)
+    recorded = NativeRuns(code, first_run, runs, chunk).complete(progress)
+    return finish_result(reducer, recorded, network, smoothing)
 
 
 def _simulate_in_parts(
@@ -335,22 +338,33 @@ def _simulate_in_parts(
     arguments and the result as of `simulate_natively`.
     """
     first_run, runs, chunk = span
-    results, parts, memory = [], count_parts(network), list[list[np.ndarray]]()
-    for number, (some, world) in enumerate(split_nodes(network)):
+    parts, memory = count_parts(network), list[list[np.ndarray]]()
+    results: list[Result] = []
+
+    def finish_part(started: NativeRuns, some: Network) -> None:
+        """Append the result of the next part, of these nodes, and show its progress as that of the whole."""
+
+        def show_progress(done: int, total: int) -> None:
+            if progress is not None:
+                progress((len(results) * total + done) // parts, total)
+
+        results.append(finish_result(reducer, started.complete(show_progress), some, None))
+
+    # Threads compute a part while the part before it is finished and the next one is made ready.
+    running: tuple[NativeRuns, Network] | None = None
+    for some, world in split_nodes(network):
         make = partial(compile_runs, world, inputs, key, reducer, runs, precision=precision)
         code = try_native(make)
         if code is None:
             return None
-        if number == 0:
+        if running is None:
             check_memory_of_parts(code, parts, runs, len(inputs), precision)
-
-        def show_progress(done: int, total: int) -> None:
-            """Show the progress of this part as that of the whole."""
-            if progress is not None:
-                progress((number * total + done) // parts, total)  # noqa: B023
-
-        recorded = _run_chunks(code, first_run, runs, chunk, show_progress, memory)
-        results.append(finish_result(reducer, recorded, some, None))
+        started = NativeRuns(code, first_run, runs, chunk, memory)
+        if running is not None:
+            finish_part(*running)
+        running = started, some
+    if running is not None:
+        finish_part(*running)
     return reducer.joined(results, network)
 
 
@@ -367,20 +381,3 @@ def compile_network_runs(
     world = build_world(network, None if smoothing is None else smoothing.kinds)
     later = None if smoothing is None else smoothing.smoother(world.filters)
     return compile_runs(world, inputs, key, reducer, runs, later, precision=precision)
-
-
-def _run_chunks(
-    code: NativeProgram,
-    first_run: int,
-    runs: int,
-    chunk: int,
-    progress: Progress | None,
-    memory: list[list[np.ndarray]] | None = None,
-) -> ReducedRuns:
-    """Run a native program: return the sums over all runs, and what is collected of them.
-
-    `chunk`: how many runs between two reports of progress. `memory`: as of `NativeLanes`; None: new memory.
-    """
-    lanes = NativeLanes(code, first_run, first_run + runs, [] if memory is None else memory)
-    parts = advance_in_chunks(lanes.advance, LANES, wide=False, runs=(runs, chunk), progress=progress)
-    return lanes.total()._replace(collected=lanes.join_chunks(parts))

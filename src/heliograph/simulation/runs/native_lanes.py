@@ -1,6 +1,6 @@
 """Runs of a native program, dealt to lanes whose sums are apart: a lane's runs are computed by one thread at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,7 +9,13 @@ import numpy as np
 from heliograph.engine.choice import get_thread_pool
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.runs.lanes import LANES, count_runs_by_batch
+from heliograph.simulation.runs.lanes import (
+    LANES,
+    Progress,
+    advance_in_chunks,
+    count_runs_by_batch,
+    split_into_chunks,
+)
 from heliograph.simulation.smoothed import ReducedRuns
 
 
@@ -20,28 +26,53 @@ class NativeProgram(NamedTuple):
     tree: Any
 
 
-class NativeLanes:
-    """Blocks of runs dealt to lanes with separate sums, computed by native code."""
+class _RunningChunk(NamedTuple):
+    """A chunk that threads simulate: the numbers of its runs, lane after lane, and what each lane collects of them.
 
-    def __init__(self, code: NativeProgram, first_run: int, stop: int, memory: list[list[np.ndarray]]):
-        """Begin with no sums.
+    To iterate over `collected_by_lane` waits for the lanes; each has an array (run, ...) or None for each leaf.
+    """
+
+    runs: np.ndarray
+    collected_by_lane: Iterator[list[np.ndarray | None]]
+
+
+class NativeRuns:
+    """Runs of a native program, dealt to lanes with separate sums, chunk by chunk.
+
+    Threads compute the first chunk from the moment that this is made, while the caller does something else: it may make
+    the next program ready, or finish the runs of the last one.
+    """
+
+    def __init__(
+        self, code: NativeProgram, first_run: int, runs: int, chunk: int, memory: list[list[np.ndarray]] | None = None
+    ):
+        """Start the first chunk.
 
         Args:
             code: the program.
             first_run: number of the first run.
-            stop: number after that of the last run.
-            memory: sums of an earlier simulation that nobody needs, taken for those of this one, and given back. To
-                allocate those of a few nodes and runs would take as long as to compute them.
+            runs: how many.
+            chunk: how many between two reports of progress.
+            memory: sums of earlier runs that nobody needs, taken for those of these, and given back; None: new memory.
+                To allocate those of a few nodes and runs would take as long as to compute them.
         """
-        self.code, self.first_run, self.stop, self.memory = code, first_run, stop, memory
+        self.code, self.first_run, self.runs = code, first_run, runs
+        self.memory: list[list[np.ndarray]] = [] if memory is None else memory
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
+        self.chunks = split_into_chunks(LANES, False, runs, chunk)
+        self._first = self._start(self.chunks[0])
 
-    def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; return what is collected of their runs in order, by leaf.
+    def complete(self, progress: Progress | None) -> ReducedRuns:
+        """Compute all other chunks; return the sums over all runs, and what is collected of them.
 
-        A leaf is (run, ...), None where all runs share it.
+        `progress` is called after each chunk with how many runs are done, and of how many.
         """
-        numbers = np.arange(start, start + blocks)
+        parts = advance_in_chunks(self._advance, self.chunks, self.runs, progress)
+        return self._total()._replace(collected=self._join_chunks(parts))
+
+    def _start(self, blocks: range) -> "_RunningChunk":
+        """Let threads simulate these blocks, each lane's in order."""
+        numbers = np.array(blocks)
         runs_of_lane = {lane: self._list_runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
         used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
 
@@ -51,20 +82,30 @@ class NativeLanes:
             collected: list[np.ndarray | None] = self.code.begun.add(runs_of_lane[lane], sums)
             return collected
 
-        collected_by_lane = list(get_thread_pool().map(simulate_lane, used))
+        return _RunningChunk(
+            runs=np.concatenate([runs_of_lane[lane] for lane in used]),
+            collected_by_lane=get_thread_pool().map(simulate_lane, used),  # begins at once
+        )
+
+    def _advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
+        """Simulate `blocks` blocks from number `start` on; return what is collected of their runs in order, by leaf.
+
+        A leaf is (run, ...), None where all runs share it.
+        """
+        running = self._first if start == self.chunks[0].start else self._start(range(start, start + blocks))
         # Each leaf of all lanes, with the runs sorted by their numbers; None where all runs share it.
-        order = np.argsort(np.concatenate([runs_of_lane[lane] for lane in used]), kind="stable")
+        order = np.argsort(running.runs, kind="stable")
         leaves: list[np.ndarray | None] = []
-        for parts in zip(*collected_by_lane, strict=True):
+        for parts in zip(*running.collected_by_lane, strict=True):
             leaves.append(None if parts[0] is None else to_double(np.concatenate(parts)[order]))
         return leaves
 
     def _list_runs(self, blocks: np.ndarray) -> np.ndarray:
         """Return the runs of these blocks, without those beyond the last."""
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
-        return runs[runs < self.stop]
+        return runs[runs < self.first_run + self.runs]
 
-    def total(self) -> ReducedRuns:
+    def _total(self) -> ReducedRuns:
         """Return the sums over all runs, by batch, and give their memory back; nothing that is collected."""
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
@@ -76,10 +117,11 @@ class NativeLanes:
             by_batch = next(totals) if is_summed and fixed is None else None
             leaves.append(by_batch if fixed is None else to_double(fixed))
             common.append(fixed is not None)
+        count = count_runs_by_batch(self.first_run, self.first_run + self.runs)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return ReducedRuns(sums=sums, common=same, runs=count_runs_by_batch(self.first_run, self.stop), collected=None)
+        return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
 
-    def join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
+    def _join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return what is collected of all runs (run, ...), from what `advance` returned of each chunk of them.
 
         A result that all runs share is a view of one.
@@ -87,7 +129,7 @@ class NativeLanes:
         leaves: list[Any] = []
         for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):
             if fixed is not None:
-                leaves.append(np.broadcast_to(to_double(fixed), (self.stop - self.first_run, *fixed.shape)))
+                leaves.append(np.broadcast_to(to_double(fixed), (self.runs, *fixed.shape)))
             elif len(chunks) > 1 and chunks[0] is not None:
                 leaves.append(np.concatenate(chunks))
             else:  # one chunk is not copied; None is what is not collected
