@@ -9,6 +9,7 @@ from .lanes import advance_in_chunks as advance_in_chunks
 from .lanes import count_runs_by_batch as count_runs_by_batch
 from .lanes import has_processor_alone as has_processor_alone
 from .lanes import is_shared as is_shared
+from .lanes import split_into_chunks as split_into_chunks
 from .map_over_runs import over_runs as over_runs
 from .memory import NeededMemory as NeededMemory
 from .memory import check_memory as check_memory
