@@ -10,7 +10,7 @@ import sys
 from collections import Counter
 from time import process_time
 
-from tests.simulation.declared.test_judgement import DECLARED, FILTER, MEMORY, WHITE, fixes, said
+from tests.simulation.declared_noise.test_judgement import DECLARED, FILTER, MEMORY, WHITE, fixes, said
 
 import heliograph as hg
 

@@ -48,10 +48,10 @@ from .model.sensor import (
 from .model.sensor import (
     state_space as state_space,
 )
-from .model.unknown_start import (
+from .model.diffuse_start import (
     diffuse as diffuse,
 )
-from .model.modes_of_motion import (
+from .model.markov_jump_models import (
     markov_plant as markov_plant,
     markov_sensor as markov_sensor,
 )
@@ -129,7 +129,7 @@ from .simulation.simulate import (
     monte_carlo as monte_carlo,
     simulate as simulate,
 )
-from .simulation.recorded import (
+from .simulation.filter_recording import (
     run as run,
 )
 from .simulation.likelihood import (

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
-from heliograph.model.checks.inputs import do_inputs_spoil
+from heliograph.model.checks.plant_inputs import do_inputs_spoil
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.types import PyTree
 

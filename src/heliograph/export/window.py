@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.export.layout import Layout, lay_out_array, lay_out_struct
 from heliograph.export.program import Real, StepProgram
 from heliograph.filters.base import AbstractFilter
-from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
+from heliograph.model.checks.split_intervals import explain_uneven_prediction, find_indivisible_part
 from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_count, fail
@@ -64,9 +64,9 @@ def check_window(filter: AbstractFilter, steps: object) -> int:
         raise fail("window", expected, f"one that covers {filter.horizon} steps")
     premise = filter.premise
     if premise is not None:
-        if what := find_part_by_steps(premise.plant, premise.sensor, premise.channel, premise.trigger):
+        if what := find_indivisible_part(premise.plant, premise.sensor, premise.channel, premise.trigger):
             raise fail("window", expected, what)
-        if what := explain_unevenness(first(premise.plant), filter.inputs.index(TIME_STEP)):
+        if what := explain_uneven_prediction(first(premise.plant), filter.inputs.index(TIME_STEP)):
             warnings.warn(f"window: predictions depend on what comes late: {what}", stacklevel=4)
     return count
 

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.files.sources.reading import Unread
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
-from heliograph.model.checks.refusals import Reason, RefusedError
+from heliograph.model.checks.refusal_reasons import Reason, RefusedError
 from heliograph.numerics.check import fail
 from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_unset_stamps
 from heliograph.numerics.types import Bool, Float, Int

@@ -22,7 +22,7 @@ from heliograph.files.recording import Recording
 from heliograph.files.sources.reading import Reading, Unread
 from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.module import readable

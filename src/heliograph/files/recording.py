@@ -12,7 +12,7 @@ from heliograph.files.rows import Rows
 from heliograph.files.table import TIME, columns_of, read_rows, write_table
 from heliograph.files.table_rows import KeptRows, RowsAsColumns, join_cells, keep_rows, order_rows
 from heliograph.files.table_writer import read_back_name
-from heliograph.model.checks.inputs import find_time_step_fault
+from heliograph.model.checks.plant_inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable

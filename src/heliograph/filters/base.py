@@ -19,7 +19,7 @@ from heliograph.filters.run_over_data import Filtered, run_over_data, scan_insid
 from heliograph.filters.sizes import make_sizes
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, make_smoother_step
 from heliograph.filters.vector_check import check_vector
-from heliograph.model.checks.inputs import check_time_step, do_inputs_spoil
+from heliograph.model.checks.plant_inputs import check_time_step, do_inputs_spoil
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.model.premises.premise import NOTHING, Premise, StaticPremise, believes

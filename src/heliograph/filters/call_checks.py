@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.model.checks.inputs import check_inputs, do_inputs_spoil
+from heliograph.model.checks.plant_inputs import check_inputs, do_inputs_spoil
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.numpy_or_jax import is_traced
 from heliograph.numerics.types import Array, PyTree

@@ -5,11 +5,11 @@ from heliograph.filters.gaussian.factories import cubature_filter, kalman_filter
 from heliograph.filters.linear.linear import linear_filter
 from heliograph.filters.modes.multiple_model import imm_filter
 from heliograph.model.channel import Channel
+from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor, check_sensor
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.check import fail, flag, instance
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memories_of_channels import memories
@@ -31,7 +31,7 @@ def likelihood_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, line
     """
     if memories((plant, sensor)):
         return imm_filter(plant, sensor, channel)
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     check_sensor(first(sensor), len(start.states))
     link = instance("channel", first(channel), AbstractRandomAffine, "a channel")
     if isinstance(start.initial_covariance, UnknownStart):

@@ -12,10 +12,16 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
-from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.row_times import check_dates, find_common_dates
+from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.model.checks.row_times import find_common_dates, read_row_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.forecast_origin import KeptOrigin, Origin, find_usual_months, find_usual_spacing, last_input
+from heliograph.model.forecast_origin import (
+    KeptOrigin,
+    Origin,
+    find_median_spacing,
+    find_months_between_rows,
+    last_input,
+)
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
@@ -193,8 +199,8 @@ def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, d
         u: inputs (rows, inputs).
         dates: of the rows; None where they have none, and their numbers are their times.
     """
-    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_usual_spacing(dates))
-    months = 0 if dates is None else find_usual_months(dates)
+    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_median_spacing(dates))
+    months = 0 if dates is None else find_months_between_rows(dates)
     return Origin(
         model=filter,
         state=state,
@@ -269,7 +275,7 @@ def check_data(
     Dates by which the rows of a table are known are judged: in order, the same in both, of equal steps or with dt.
     `begin` rows were before them.
     """
-    check_dates(filter.inputs, _name_tables(measurements, inputs))
+    read_row_dates(filter.inputs, _name_tables(measurements, inputs))
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.

@@ -29,8 +29,8 @@ from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
+from heliograph.simulation.filter_recording import run
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.recorded import run
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:  # an extra

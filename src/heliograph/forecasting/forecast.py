@@ -20,7 +20,7 @@ from heliograph.forecasting.outlook import (
     prediction_of,
 )
 from heliograph.forecasting.prediction import Forecast
-from heliograph.model.enlarged.joint_sensors import joint_sensor
+from heliograph.model.augmented.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first

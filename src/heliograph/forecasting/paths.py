@@ -11,7 +11,7 @@ from heliograph.forecasting.forecast import ForecastTarget, check_covered, find_
 from heliograph.forecasting.horizons import Horizons, Inputs, check_ahead, find_rows_ahead
 from heliograph.forecasting.origins import origin_of
 from heliograph.model.forecast_origin import HasOrigin
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, transition_over
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transition_over
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor

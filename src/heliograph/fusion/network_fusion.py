@@ -10,7 +10,7 @@ from heliograph.fusion.report_link import ReportLink, ReportLinks, check_reports
 from heliograph.fusion.rules import AbstractFusion
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim
-from heliograph.model.over_time import first, stack, stacked
+from heliograph.model.over_time import first, stack, stack_over_time
 from heliograph.numerics.check import check_count, fail, instance, scalar, spread_over_names
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -133,7 +133,7 @@ class Fusion(Module):
             return self.rule.claim(claims)
         # All are of one kind, and that alone decides the claim.
         quantizer = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
-        kind = stacked(quantizer)
+        kind = stack_over_time(quantizer)
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:

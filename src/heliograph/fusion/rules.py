@@ -20,7 +20,7 @@ from heliograph.fusion.covariance_intersection import (
 from heliograph.fusion.mesh.graph import Graph
 from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights, NodeGains, NodeStep, gains_of
 from heliograph.model.estimate import Claim, Estimate, weakest
-from heliograph.model.plant import AnyPlant, manifold_among
+from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.numerics.angle import wrap_angles, wrap_near
 from heliograph.numerics.check import (
     array,
@@ -112,7 +112,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
     rule.check(len(estimates))
     # Angles within half a turn of those of the first estimate.
     means = np.stack([np.asarray(fill_masked(e.mean)) for e in estimates], axis=-2)
-    places, attitude = manifold_among(angles, means.shape[-1])
+    places, attitude = read_manifold(angles, means.shape[-1])
     if attitude or any(estimate.attitude for estimate in estimates):
         raise fail("fusion", "estimates without attitudes", [estimate.attitude or attitude for estimate in estimates])
     means = wrap_near(means, means[..., :1, :], places)

@@ -10,7 +10,7 @@ from heliograph.factors.square_root_update import covariance_of_root, observe_ro
 from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, repeat_last_step
 from heliograph.model.estimate import Claim, weakest
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.lapack import spectral_radius
 from heliograph.numerics.types import Float
@@ -124,9 +124,9 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         gains, root = _make_gains(system, matrices, covariances), covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
-    over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
-    claim = _lower_unsupported_claim(claim, rounding.worst, rounding.when)
-    return on_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
+    over_time = Gains(*(repeat_last(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
+    claim = _support_claim(claim, rounding.worst, rounding.when)
+    return with_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
 
 
 def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionStep) -> Gains:

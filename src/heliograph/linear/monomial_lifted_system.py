@@ -14,7 +14,7 @@ from heliograph.linear.system import LinearSystem, Steps, repeat_last_step
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.lapack import spectral_radius
@@ -202,7 +202,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     moments = initial_monomial_moments(plant_0, 2 * degree)
     premise = Premise(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
-        return on_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
+        return with_premise(_lift_chain(routes, degree, moments, (n, m)), premise)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
     mean, spread = mean_and_spread(second)
@@ -217,7 +217,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         received_rounding=received_rounding,
         start_rounding=EPS * np.diag(second)[:-1],
     )
-    return on_premise(system, premise)
+    return with_premise(system, premise)
 
 
 def _lift_chain(

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.over_time import OverTime, first, list_steps, steps_covered
+from heliograph.model.over_time import OverTime, first, list_models_by_step, steps_covered
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import check_horizon, fail
@@ -90,4 +90,4 @@ def list_checked_steps(model: T | OverTime, horizon: int) -> list[T]:
     """Return a plant, sensor or channel at each of `horizon` steps."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))
-    return list_steps(model, horizon)
+    return list_models_by_step(model, horizon)

@@ -20,7 +20,7 @@ from heliograph.linear.system import Gains, LinearSystem, Schedule, Steps, state
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -88,7 +88,7 @@ def quadratic_system_with_linear_estimate(
         second = next_second
     over_time = Steps(*map(np.array, zip(*steps, strict=True)))
     system = LinearSystem(over_time, mean, spread, projection=make_linear_rows(total, 2, n), rounding=rounding)
-    return on_premise(system, Premise(plant, sensor, channel, order=4))
+    return with_premise(system, Premise(plant, sensor, channel, order=4))
 
 
 def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:

@@ -11,7 +11,7 @@ from heliograph.linear.known_loss_stability import BELOW_ONE, KnownLossSystem, c
 from heliograph.linear.lmmse_recursion import find_noise_roots, step_covariance_roots
 from heliograph.linear.system import Steps
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant, OfInputs
+from heliograph.model.plant import AnyPlant, LinearPlant, MatrixOfInputs
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail, standard_deviations
 from heliograph.numerics.lapack import spectral_radius
@@ -111,7 +111,7 @@ def plant_matrices(plant: AnyPlant, what: str = "plant") -> tuple[Float[np.ndarr
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
-        or isinstance(plant.matrix, OfInputs)
+        or isinstance(plant.matrix, MatrixOfInputs)
     ):
         raise fail(what, "a LinearPlant that does not vary", _describe_type(plant))
     refuse_angles(what, plant)

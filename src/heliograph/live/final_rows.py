@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from heliograph.numerics.types import Float
-from heliograph.simulation.rows.columns import FilterColumns
+from heliograph.simulation.rows.output_columns import FilterColumns
 
 
 class FinalRows:

@@ -16,11 +16,11 @@ from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
 from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, lay_side_by_side
-from heliograph.model.checks.refusals import count_by_reason
-from heliograph.model.limits import Limits
+from heliograph.model.checks.refusal_reasons import count_by_reason
 from heliograph.model.over_time import steps_covered
+from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.repeated_readings import Repeats
-from heliograph.model.timeouts import name_unit
+from heliograph.model.timeouts import name_timeout_unit
 from heliograph.numerics.check import TINY, check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 
@@ -226,7 +226,7 @@ class Fleet:
             screened = screened._replace(repeats=watch.extend_runs(screened.event.values, screened.repeats))
         return screened
 
-    def _screen_by_limits(self, limits: Limits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
+    def _screen_by_limits(self, limits: ReadingLimits, node: str, unscreened: ScreenedEvent) -> ScreenedEvent:
         """Return an event without the values that a node's limits refuse; `repeats` are at first those before it."""
         event, values = unscreened.event, np.array(unscreened.event.values)
         screened = limits.screen(values[None], unscreened.repeats)
@@ -363,7 +363,8 @@ class Fleet:
         by_steps, watermark = self.program.dt is None, plant.confirmed - self.options.window
         final = ceil(max(watermark, -1.0)) - 1 if by_steps else max(watermark, plant.begun)
         now = floor(min(now, self.end_step)) if by_steps else now
-        unit = name_unit(self.network.inputs) or ("" if plant.origin is None else "s")  # dates are seconds apart
+        by_dates = plant.origin is not None  # dates are seconds apart
+        unit = name_timeout_unit(self.network.inputs) or "s" * by_dates
         statuses = {}
         for name, rule in self.watched.items():
             # When the newest value was measured that was used; no step is below 0.

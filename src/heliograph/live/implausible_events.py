@@ -12,12 +12,12 @@ from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
 from heliograph.live.plant import PlantState
 from heliograph.live.sorted_rows import BEFORE, HeldRow
-from heliograph.model.checks.faults import find_function_fault
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Float
-from heliograph.simulation.description.wide_angles import WideAngles
+from heliograph.simulation.description.angle_doubts import WideAngles
 from heliograph.simulation.network import Network
-from heliograph.simulation.rows.columns import FilterColumns
+from heliograph.simulation.rows.output_columns import FilterColumns
 
 TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
@@ -138,7 +138,7 @@ class JudgementReader:
             if not sentence and tries < TRIES:
                 inputs, step = self.fleet.pool.inputs_between(row_before.slot, row.slot)
                 estimate = self._estimate_after(row_before, filter, columns)
-                sentence = find_function_fault(filter, estimate, inputs, step)
+                sentence = describe_non_finite_function(filter, estimate, inputs, step)
                 self._faults[columns.node, columns.filter] = tries + 1, sentence
             if sentence:
                 return f"; {sentence}"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from heliograph.live.clock_leap import Moments
 from heliograph.live.event import CheckedEvent, Verdict
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.repeated_readings import Repeats
 
 NO_REPEATS, NONE = Repeats(), dict[Reason, int]()

@@ -3,7 +3,7 @@
 from functools import cached_property
 
 from heliograph.live.stored.snapshot import Identity, network_identity
-from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
+from heliograph.model.checks.split_intervals import explain_uneven_prediction, find_indivisible_part
 from heliograph.model.over_time import first, steps_covered
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.caching import share_by_object
@@ -28,10 +28,10 @@ def find_time_input(network: Network) -> int | None:
         raise fail("timeline", expected, f"one that covers {steps_covered(network)} steps")
     if network.relays is not None:
         raise fail("timeline", expected, "relays that talk in slots")
-    if what := find_part_by_steps(network.plant):
+    if what := find_indivisible_part(network.plant):
         raise fail("timeline", expected, what)
     for name, node in network.nodes.items():
-        if isinstance(node, Node) and (what := find_part_by_steps(None, node.sensor, node.channel, node.trigger)):
+        if isinstance(node, Node) and (what := find_indivisible_part(None, node.sensor, node.channel, node.trigger)):
             raise fail("timeline", expected, f"{what}, at node {name!r}")
     return network.inputs.index(TIME_STEP)
 
@@ -57,7 +57,7 @@ class NetworkProgram:
         self.network, self.claims, self.dt = network, network.claims(), find_time_input(network)
         if not any(self.claims.values()):
             raise fail("network", "at least one filter to run", "none")
-        self.uneven = "" if self.dt is None else explain_unevenness(first(network.plant), self.dt)
+        self.uneven = "" if self.dt is None else explain_uneven_prediction(first(network.plant), self.dt)
         # Sizes of a row: measurements of all nodes, and inputs other than dt.
         self.received = sum(node.received for node in network.nodes.values())
         self.given = len(network.inputs) - (self.dt is not None)

@@ -6,9 +6,15 @@ from math import ceil, inf, log
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import unstack
-from heliograph.model.repeated_readings import LEAST, SELDOM, Repeats, bound_equal_readings, delivers_as_sent
+from heliograph.model.repeated_readings import (
+    LEAST,
+    SELDOM,
+    Repeats,
+    bound_probability_of_equal_readings,
+    delivers_as_sent,
+)
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.random_affine.noise import AbstractNoise
 from heliograph.simulation.node import Node
@@ -22,11 +28,12 @@ class RepeatWatch:
     """Watch for runs of equal readings that noise makes less than once in 10^9 readings, one sensor's, one by one.
 
     A reading of resolution q equals the one before with probability at most p(q), whatever the sensor measures
-    (`bound_equal_readings`), and p grows with q. Where no resolution is declared, the least difference of two
-    successive readings so far is a multiple of q, so that its p is a bound too; where all were equal that is 1, and
-    nothing is found. A law may be stated too large, or repeat values by itself: p is at least (e + 1) / (o + 2), where
-    e of the o pairs of successive readings outside of the run were equal. A run of n readings begins at a reading with
-    probability at most p^(n - 1), and is found where that is at most SELDOM: one by chance is at most so rare.
+    (`bound_probability_of_equal_readings`), and p grows with q. Where no resolution is declared, the least difference
+    of two successive readings so far is a multiple of q, so that its p is a bound too; where all were equal that is 1,
+    and nothing is found. A law may be stated too large, or repeat values by itself: p is at least (e + 1) / (o + 2),
+    where e of the o pairs of successive readings outside of the run were equal. A run of n readings begins at a
+    reading with probability at most p^(n - 1), and is found where that is at most SELDOM: one by chance is at most so
+    rare.
 
     Args:
         noises: laws of the sensor's noise, one for each that it has over time.
@@ -42,7 +49,7 @@ class RepeatWatch:
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
             return None
-        if any(len(models_of(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
+        if any(len(list_mode_models(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
             return None
         outputs = tuple(range(received))
         if len(steps[0].outputs) != received or not all(delivers_as_sent(link, outputs) for link in unstack(channel)):
@@ -50,7 +57,7 @@ class RepeatWatch:
         noises = list({id(step.noise): step.noise for step in steps}.values())
         try:
             for noise in noises:
-                bound_equal_readings(noise, np.full(received, inf))
+                bound_probability_of_equal_readings(noise, np.full(received, inf))
         except ValueError:  # a law of which no bound is known
             return None
         return RepeatWatch(noises)
@@ -117,7 +124,10 @@ class RepeatWatch:
         if key not in self._bounds:
             if len(self._bounds) > KEPT_BOUNDS:
                 self._bounds.clear()
-            bounds = [bound_equal_readings(noise, np.full(noise.dimension, step))[output] for noise in self.noises]
+            bounds = [
+                bound_probability_of_equal_readings(noise, np.full(noise.dimension, step))[output]
+                for noise in self.noises
+            ]
             self._bounds[key] = float(max(bounds))
         return self._bounds[key]
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.over_time import first
 from heliograph.model.timeouts import describe_silence
 from heliograph.model.trigger import AbstractTrigger, Periodic

@@ -14,17 +14,17 @@ from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
 from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
-from heliograph.model.checks.faults import find_function_fault
-from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
+from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.model.checks.refusal_reasons import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
-from heliograph.model.limits import LimitsLike, ScreenedReadings, make_limits
+from heliograph.model.reading_limits import LimitsLike, ScreenedReadings, make_limits
 from heliograph.model.repeated_readings import Repeats, StuckLike
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.description.wide_angles import WideAngles
+from heliograph.simulation.description.angle_doubts import WideAngles
 
 COUNTED: tuple[Reason, ...] = (*SCREENED, "gate")
 BEYOND = 10  # measurements in a row, each beyond what an honest filter sees with probability RARE
@@ -253,7 +253,7 @@ class Stream:
     def _name_faulty_function(self, u: np.ndarray) -> str:
         """Return, after "; ", the function of the filter's model that gives no number for inputs u; "" if none does."""
         before = self.filter.estimate(self._compiled.state.unflatten(self._stepper.state))
-        fault = find_function_fault(self.filter, before, u, self.steps)
+        fault = describe_non_finite_function(self.filter, before, u, self.steps)
         return f"; {fault}" if fault else ""
 
     def sender(self) -> SenderStatus:

@@ -10,11 +10,11 @@ from .channel import (
     silent as silent,
     with_direct_link as with_direct_link,
 )
-from .enlarged.clocks import (
+from .augmented.clocks import (
     Clock as Clock,
     with_clocks as with_clocks,
 )
-from .enlarged.joint_sensors import (
+from .augmented.joint_sensors import (
     joint_sensor as joint_sensor,
 )
 from .estimate import (
@@ -28,7 +28,7 @@ from .fading import (
     without_memory as without_memory,
     autoregressive_fading as autoregressive_fading,
 )
-from .modes_of_motion import (
+from .markov_jump_models import (
     ModalPlant as ModalPlant,
     ModalSensor as ModalSensor,
 )
@@ -38,7 +38,7 @@ from .over_time import (
     steps_covered as steps_covered,
     OverTime as OverTime,
 )
-from .enlarged.past_outputs import (
+from .augmented.past_outputs import (
     with_past as with_past,
 )
 from .relays import (
@@ -47,10 +47,10 @@ from .relays import (
 from .sensor import (
     AbstractSensor as AbstractSensor,
 )
-from .enlarged.bias import (
+from .augmented.bias import (
     with_bias as with_bias,
 )
-from .reported_numbers import (
+from .channel_side_information import (
     Pilot as Pilot,
     told as told,
 )

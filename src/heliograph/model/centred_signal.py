@@ -1,4 +1,4 @@
-"""Signals that cost less: what sender and receiver both expect is taken off before sending and added back after."""
+"""Centred signals, which cost less: a reference that both ends know is subtracted before sending, added back after."""
 
 from typing import overload
 
@@ -10,7 +10,7 @@ from heliograph.engine.choice import compile_on_call
 from heliograph.model.channel import Channel, amplify_and_forward
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first, steps_covered
-from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, read_first_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
 from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.numpy_or_jax import library
@@ -89,7 +89,7 @@ def expected_signal(
         ValueError: a horizon beyond what varies over time, a sensor that does not fit, inputs of another shape.
     """
     check_horizon(horizon, steps_covered((plant, sensor)))
-    plant_0 = check_plant(plant)
+    plant_0 = read_first_plant(plant)
     check_sensor(first(sensor), len(plant_0.states))
     if inputs is None and plant_0.inputs:
         raise fail("inputs", f"an array ({horizon}, {len(plant_0.inputs)}) of {list(plant_0.inputs)}", "none")

@@ -7,12 +7,18 @@ from typing import Literal, overload
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.channel_side_information import (
+    KnownGain,
+    Pilot,
+    append_told_gain,
+    build_with_told_numbers,
+    stack_channels_with_told_numbers,
+)
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, at_each_step, first, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.reported_numbers import KnownGain, Pilot, build_with_told, stack_with_told, tell_gain
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor
-from heliograph.model.turn_invariance import check_turns
+from heliograph.model.turn_invariance import check_turn_invariance
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.manifold import Manifold
@@ -108,7 +114,7 @@ def hop(
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
     radio_hop = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
-    link = tell_gain(radio_hop, known)
+    link = append_told_gain(radio_hop, known)
     return link if delay is None else delayed(link, delay)
 
 
@@ -156,7 +162,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
         ValueError: no hop, hops whose dimensions do not fit, time stamps on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return build_with_told(connect_in_series, separate_memories(check_maps("series", hops)))
+    return build_with_told_numbers(connect_in_series, separate_memories(check_maps("series", hops)))
 
 
 def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> DelayedLink:
@@ -173,7 +179,9 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
-    return build_with_told(lambda links: DelayedLink(links[0], delay, timestamped), check_maps("delayed link", [link]))
+    return build_with_told_numbers(
+        lambda links: Delayed(links[0], delay, timestamped), check_maps("delayed link", [link])
+    )
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
@@ -196,7 +204,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
         nothing = silent(links[0].outputs, links[0].inputs)
         return Mixture([links[0], nothing], library(p).stack([p, 1 - p]), radius)
 
-    return build_with_told(build, check_maps("dropout", [channel]))
+    return build_with_told_numbers(build, check_maps("dropout", [channel]))
 
 
 def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
@@ -211,7 +219,7 @@ def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
     Raises:
         ValueError: an arrival probability outside [0, 1]; later, when asked for moments.
     """
-    return build_with_told(lambda links: Erasure(links[0], arrival), check_maps("erasure", [channel]))
+    return build_with_told_numbers(lambda links: Erasure(links[0], arrival), check_maps("erasure", [channel]))
 
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
@@ -224,10 +232,12 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    return stack_with_told(_make_as_late, separate_memories(check_maps("stack", [relayed, direct])))
+    return stack_channels_with_told_numbers(
+        _delay_all_like_latest, separate_memories(check_maps("stack", [relayed, direct]))
+    )
 
 
-def _make_as_late(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return links of one signal, each as late as the latest."""
     past = max(c.past for c in links)
     return [c if c.past == past else place_channel_of_part(c, signal_size(c), 0, past) for c in links]
@@ -242,10 +252,12 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    return stack_with_told(_place_links, separate_memories(check_maps("parallel channels", channels)))
+    return stack_channels_with_told_numbers(
+        _select_part_for_each_link, separate_memories(check_maps("parallel channels", channels))
+    )
 
 
-def _place_links(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
+def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
     total, past = sum(signal_size(link) for link in links), max(link.past for link in links)
     placed = []
@@ -273,13 +285,13 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
             flags or time stamps, which would be added up.
     """
     separate = separate_memories(check_maps("links of a sum", links))
-    return build_with_told(partial(_add_links, noise=noise, same=same), separate)
+    return build_with_told_numbers(partial(_add_up_links, noise=noise, same=same), separate)
 
 
-def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
+def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bool) -> Superposed:
     """Check links without what is told of them, place each on the signal, and add them up."""
     for i, link in enumerate(links, 1):
-        _check_added(f"link {i} of a sum", link)
+        _check_can_be_added(f"link {i} of a sum", link)
     sizes, sent = [link.outputs for link in links], [signal_size(link) for link in links]
     if len(set(sizes)) > 1:
         raise fail("links of a sum", "links of one number of outputs", sizes)
@@ -294,7 +306,7 @@ def _add_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
     return Superposed(links, as_noise("noise of a sum", noise, sizes[0]), places, (1 + past) * total)
 
 
-def _check_added(name: str, link: AbstractRandomAffine) -> None:
+def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:
     """Raise ValueError where a link delivers what cannot be added up."""
     inside = [link, *all_inner_maps(link)]
     if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in inside):
@@ -355,8 +367,10 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
     """Return the indices of received components that are angles; plant, sensor and channel must fit each other."""
     plant_0 = first(plant)
     senses = first(sensor).typical(plant_0.inputs)
-    for model in models_of(senses):
-        check_turns("sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(senses.angles))
+    for model in list_mode_models(senses):
+        check_turn_invariance(
+            "sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(senses.angles)
+        )
     steps = unstack(channel) if senses.circular else [first(channel)]
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:

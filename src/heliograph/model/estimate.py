@@ -59,7 +59,7 @@ class Estimate(Module):
     @property
     def claims(self) -> np.ndarray:
         """The claim of each estimate, (...): "none" where mean or covariance are no numbers, or the latter is none."""
-        return np.where(is_sound(self), self.claim, "none")
+        return np.where(mask_sound_estimates(self), self.claim, "none")
 
 
 @readable
@@ -122,7 +122,7 @@ def weakest(claims: list[Claim]) -> Claim:
     return min(claims, key=STRENGTH.__getitem__)
 
 
-def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
+def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
     """Lower a claim to what the noises of these models support.
 
     "upper" where one is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps of
@@ -135,26 +135,26 @@ def lower_by_noise(claim: Claim, *models: PyTree) -> Claim:
     return weakest([claim, "upper"]) if bounded else claim
 
 
-def is_sound(estimate: Estimate) -> np.ndarray:
-    """Return which means are finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+def mask_sound_estimates(estimate: Estimate) -> np.ndarray:
+    """Return which of some estimates have a finite mean and, where one is claimed, a covariance (to rounding)."""
     finite = ~find_not_finite(np.asarray(estimate.mean), 1)
     if estimate.claim == "none":
         return finite
-    return np.asarray(finite & _are_covariances(np.asarray(estimate.covariance)))
+    return np.asarray(finite & _mask_covariances_over_time(np.asarray(estimate.covariance)))
 
 
-def _are_covariances(bound: np.ndarray) -> np.ndarray:
-    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
-    # Of a long recording most are the matrix of the row before, and judged with it.
+def _mask_covariances_over_time(bound: np.ndarray) -> np.ndarray:
+    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, equal ones judged once."""
+    # In a long recording of a filter that has settled most matrices (time, n, n) are equal to the one before.
     if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
         rows = bound.reshape(len(bound), -1)
         changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
-        return np.asarray(_judge_covariances(bound[changes])[np.cumsum(changes) - 1])
-    return _judge_covariances(bound)
+        return np.asarray(_mask_covariances(bound[changes])[np.cumsum(changes) - 1])
+    return _mask_covariances(bound)
 
 
-def _judge_covariances(bound: np.ndarray) -> np.ndarray:
-    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding, judged one by one."""
+def _mask_covariances(bound: np.ndarray) -> np.ndarray:
+    """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
     finite = ~find_not_finite(bound, 2)
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
         return np.asarray(finite)
@@ -196,6 +196,6 @@ def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
 
     Several estimates side by side are returned as they are: `claims` says of which theirs holds.
     """
-    if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or is_sound(estimate).all():
+    if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or mask_sound_estimates(estimate).all():
         return estimate
     return replace(estimate, claim="none")

@@ -68,7 +68,7 @@ def last_input(u: np.ndarray) -> np.ndarray:
     return np.array(u[-1] if len(u) else np.full(u.shape[1], np.nan), dtype=float)
 
 
-def find_usual_spacing(time: np.ndarray) -> float:
+def find_median_spacing(time: np.ndarray) -> float:
     """Return the median time between rows, of dates in seconds; NaN of fewer than two."""
     if len(time) < 2:
         return float("nan")
@@ -76,7 +76,7 @@ def find_usual_spacing(time: np.ndarray) -> float:
     return float(steps[0] if steps.min() == steps.max() else np.median(steps))
 
 
-def find_usual_months(time: np.ndarray) -> int:
+def find_months_between_rows(time: np.ndarray) -> int:
     """Return how many months of the calendar lie between rows that are firsts of months; 0 of other times.
 
     Years, quarters and months have no length in seconds: steps are counted on the calendar.

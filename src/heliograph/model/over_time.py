@@ -1,4 +1,4 @@
-"""The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
+"""Models that vary over time: the marker `OverTime`, whose leading axis is time, and `at`, the model of one step."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
@@ -140,17 +140,17 @@ def unstack(model: object) -> list[PyTree]:
     return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 
-def restack(steps: Sequence[T], *models: object) -> T | OverTime:
+def vary_over_steps(steps: Sequence[T], *models: object) -> T | OverTime:
     """Return an object for each step as one that varies over time; the first alone where none of the models varies."""
     return steps[0] if steps_covered(models) is None else over_time(steps)
 
 
-def list_steps(model: PyTree, count: int) -> list[PyTree]:
+def list_models_by_step(model: PyTree, count: int) -> list[PyTree]:
     """List the objects of the first `count` steps, the same one at each where it does not vary."""
     return unstack(model)[:count] if isinstance(model, OverTime) else [model] * count
 
 
-def stacked(model: PyTree) -> PyTree:
+def stack_over_time(model: PyTree) -> PyTree:
     """Return what varies over time as one object whose arrays have a first axis of time; another as it is."""
     return model.values if isinstance(model, OverTime) else model
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.intervals import StateLimits, StateLimitsLike, read_state_limits
+from heliograph.model.diffuse_start import DiffuseStart
+from heliograph.model.limit_arguments import StateLimits, StateLimitsLike, read_state_limits
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.turn_invariance import check_turns
-from heliograph.model.unknown_start import DiffuseStart
+from heliograph.model.turn_invariance import check_turn_invariance
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.check import array, covariance, error_text, fail, function, instance, items, name_list, names
 from heliograph.numerics.linalg import cholesky
@@ -34,7 +34,7 @@ MatrixFunction = TypeAliasType("MatrixFunction", Callable[[jax.Array], ArrayLike
 MatrixLike = TypeAliasType("MatrixLike", ArrayLike | MatrixFunction)
 
 
-class OfInputs(Module):
+class MatrixOfInputs(Module):
     """A matrix M(u) of the plant's inputs; whatever takes it for a constant array is refused in one line.
 
     Args:
@@ -58,9 +58,9 @@ class OfInputs(Module):
     __array__ = __jax_array__ = __matmul__ = __rmatmul__ = __getitem__ = __len__ = __iter__ = _refuse
 
 
-def matrix_of(matrix: object, u: jax.Array) -> jax.Array:
+def matrix_under_inputs(matrix: object, u: jax.Array) -> jax.Array:
     """Return a constant matrix, or the value of one that depends on inputs."""
-    return matrix(u) if isinstance(matrix, OfInputs) else jnp.asarray(matrix)
+    return matrix(u) if isinstance(matrix, MatrixOfInputs) else jnp.asarray(matrix)
 
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -112,7 +112,7 @@ class AbstractPlant(Module):
         """Return the state x (..., n) with its angles within half a turn of those of `other`, so that they average."""
         return self.manifold.near(x, other)
 
-    def moves(
+    def make_motion_about(
         self, u: jax.Array, center: jax.Array, middle: jax.Array | None = None
     ) -> Callable[[jax.Array], jax.Array]:
         """Return x -> f(x, u) as moments are made of it, about `center` and the state `middle` after the step.
@@ -234,7 +234,7 @@ class Plant(AbstractPlant):
         limits: StateLimitsLike = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
-        self.initial_mean, self.initial_covariance, self.deviation = _read_initial(initial_mean, initial_covariance)
+        self.initial_mean, self.initial_covariance, self.deviation = _read_initial_law(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(name_list("input names", inputs)), "u")
@@ -252,7 +252,7 @@ class Plant(AbstractPlant):
         if limits and attitude:
             raise fail("limits of states", "none beside attitudes", list(self.attitude))
         self.limits = read_state_limits(limits, self.states, self.circular, self.initial_mean)
-        check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
+        check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return f(x, u)."""
@@ -275,7 +275,7 @@ class LinearPlant(AbstractPlant):
             or that a full turn changes, functions of inputs without names.
     """
 
-    matrix: Square  # or OfInputs, which refuses to be taken for an array
+    matrix: Square  # or MatrixOfInputs, which refuses to be taken for an array
     input_matrix: Matrix  # likewise
     noise: AbstractNoise | NoiseFunction
     initial_mean: Vector
@@ -296,7 +296,7 @@ class LinearPlant(AbstractPlant):
         circular: "Sequence[str]" = (),
         limits: "StateLimitsLike" = (),
     ):
-        self.initial_mean, spread, self.deviation = _read_initial(initial_mean, initial_covariance, unknown=True)
+        self.initial_mean, spread, self.deviation = _read_initial_law(initial_mean, initial_covariance, unknown=True)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.initial_covariance = spread.of_states(self.states) if isinstance(spread, DiffuseStart) else spread
@@ -320,26 +320,26 @@ class LinearPlant(AbstractPlant):
         self.circular = read_angles("circular states", circular, self.states)
         self.limits = read_state_limits(limits, self.states, self.circular, self.initial_mean)
         u = np.zeros(len(self.inputs))
-        check_turns("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
+        check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
         """Return an array, or a function of the inputs, after a check of its shape."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)
-        return OfInputs(value, name, self.inputs)
+        return MatrixOfInputs(value, name, self.inputs)
 
     def transition_matrix(self, u: jax.Array) -> jax.Array:
         """Return A (n, n) under the input u (inputs,)."""
-        return matrix_of(self.matrix, u)
+        return matrix_under_inputs(self.matrix, u)
 
     def shift(self, u: jax.Array) -> jax.Array:
         """Return B u + E w (n,) under the input u (inputs,)."""
-        return matrix_of(self.input_matrix, u) @ u + self.noise_mean()
+        return matrix_under_inputs(self.input_matrix, u) @ u + self.noise_mean()
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return A x + B u."""
-        return self.transition_matrix(u) @ x + matrix_of(self.input_matrix, u) @ u
+        return self.transition_matrix(u) @ x + matrix_under_inputs(self.input_matrix, u) @ u
 
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
@@ -352,7 +352,7 @@ def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: t
     return tuple(given)
 
 
-def _read_initial(
+def _read_initial_law(
     mean: ArrayLike, spread: NoiseLike | DiffuseStart, unknown: bool = False
 ) -> tuple[Vector, Any, AbstractNoise | None]:
     """Return the mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
@@ -372,7 +372,7 @@ def _read_initial(
 AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime holds one plant per step
 
 
-def manifold_among(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
+def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
     """Return which of so many states are angles, from their places, or also attitudes, from the plant they are of."""
     plant = first(angles)
     if not isinstance(plant, AbstractPlant):
@@ -392,7 +392,7 @@ def check_shape(name: str, called: Callable[..., object], values: tuple[object, 
         raise fail(name, f"shape {shape}", f"shape {got}")
 
 
-def check_plant(plant: AnyPlant) -> Any:
+def read_first_plant(plant: AnyPlant) -> Any:
     """Return the plant at its first step."""
     plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
     if isinstance(plant_0.noise, AbstractNoise):

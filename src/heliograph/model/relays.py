@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import at, first, stacked, steps_covered
+from heliograph.model.over_time import at, first, stack_over_time, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
@@ -112,19 +112,19 @@ class RelayNetwork(Module):
         by_slot = [_compute_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
         slot_of_step = np.arange(horizon) % period
         moments = _SlotMoments(*(np.stack(parts)[slot_of_step] for parts in zip(*by_slot, strict=True)))
-        transition = _repeat_over_steps(self.plant, horizon, lambda p: p.matrix, 2)
-        drift = _repeat_over_steps(self.plant, horizon, lambda p: p.noise.mean, 1)
+        transition = _list_arrays_by_step(self.plant, horizon, lambda p: p.matrix, 2)
+        drift = _list_arrays_by_step(self.plant, horizon, lambda p: p.noise.mean, 1)
         # E x+ = A E x + E w.
         means = [self.initial()[0]]
         for a, b in zip(transition[:-1], drift[:-1], strict=True):
             means.append(a @ means[-1] + b)
         return RelaySteps(
             transition=transition,
-            process=_repeat_over_steps(self.plant, horizon, lambda p: p.noise.covariance, 2),
+            process=_list_arrays_by_step(self.plant, horizon, lambda p: p.noise.covariance, 2),
             drift=drift,
-            sensing=_repeat_over_steps(self.sensor, horizon, lambda s: s.matrix, 2),
-            sensor_noise=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.covariance, 2),
-            sensor_offset=_repeat_over_steps(self.sensor, horizon, lambda s: s.noise.mean, 1),
+            sensing=_list_arrays_by_step(self.sensor, horizon, lambda s: s.matrix, 2),
+            sensor_noise=_list_arrays_by_step(self.sensor, horizon, lambda s: s.noise.covariance, 2),
+            sensor_offset=_list_arrays_by_step(self.sensor, horizon, lambda s: s.noise.mean, 1),
             state_mean=np.array(means),
             gain=moments.gain,
             offset=moments.offset,
@@ -218,14 +218,15 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
             gain[np.ix_(received, sent)] = moments.mean_gain
             offset[received] += moments.offset
             sent_and_one = np.append(sent, columns)  # the offset stands behind the gains of all that is sent
+            # Covariances of the link's gains and offset, (outputs, outputs, inputs + 1, inputs + 1).
             spread[np.ix_(received, received, sent_and_one, sent_and_one)] += moments.nominal.center
             receives[received], transmits[senders.index(sender)] = 1.0, 1.0
     return _SlotMoments(gain=gain, offset=offset, spread=spread, receives=receives, transmits=transmits)
 
 
-def _repeat_over_steps(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
+def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """Return one array of a plant or sensor for each step."""
-    value = np.asarray(read(stacked(model)), dtype=np.float64)
+    value = np.asarray(read(stack_over_time(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]
     return np.broadcast_to(value, (horizon, *value.shape))

@@ -82,7 +82,7 @@ def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[
     return counts, Repeats(tuple(newest), tuple(lengths))
 
 
-def bound_equal_readings(
+def bound_probability_of_equal_readings(
     noise: AbstractNoise, steps: Float[np.ndarray, " outputs"] | None = None
 ) -> Float[np.ndarray, " outputs"]:
     """Bound the probability that a reading equals the one before it, whatever the sensor measures, of each output.
@@ -100,17 +100,21 @@ def bound_equal_readings(
         ValueError: readings without a resolution, or noise that is not Gaussian, Student's or contaminated.
     """
     if isinstance(noise, RoundedNoise):
-        return bound_equal_readings(noise.source, np.asarray(noise.step))
+        return bound_probability_of_equal_readings(noise.source, np.asarray(noise.step))
     if isinstance(noise, Independent):
         ends = np.cumsum([part.dimension for part in noise.parts])[:-1]
         of_parts = [None] * len(noise.parts) if steps is None else np.split(steps, ends)
-        return np.concatenate([bound_equal_readings(*part) for part in zip(noise.parts, of_parts, strict=True)])
+        return np.concatenate(
+            [bound_probability_of_equal_readings(*part) for part in zip(noise.parts, of_parts, strict=True)]
+        )
     if steps is None:
         raise fail("stuck", "a sensor with resolution=, or after how many equal readings", "no resolution")
-    return _bound_in_step(noise, steps)
+    return _bound_probability_within_step(noise, steps)
 
 
-def _bound_in_step(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) -> Float[np.ndarray, " outputs"]:
+def _bound_probability_within_step(
+    noise: AbstractNoise, step: Float[np.ndarray, " outputs"]
+) -> Float[np.ndarray, " outputs"]:
     """Return the largest probability that one noise lies in an interval of a step, of each output."""
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
@@ -122,7 +126,7 @@ def _bound_in_step(noise: AbstractNoise, step: Float[np.ndarray, " outputs"]) ->
         return np.asarray(np.sum(np.exp(log_share) * scipy.special.erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
 
 
-def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
+def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -> Float[np.ndarray, "..."]:
     """Return the least n of which a run of n equal readings begins at a reading with probability at most `seldom`.
 
     Noise is independent from reading to reading, so that a run of n has probability at most p^(n - 1).
@@ -136,7 +140,7 @@ def longest_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDOM) -
     return np.asarray(np.maximum(n, LEAST))
 
 
-def stuck_counts(
+def find_stuck_counts(
     received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None
 ) -> Float[np.ndarray, " received"] | None:
     """Return of each received number how many equal readings in a row mean that its sensor is stuck.
@@ -168,7 +172,7 @@ def stuck_counts(
         if may_repeat:
             continue
         if isinstance(wanted, bool | np.bool_):  # True: by the law of the noise
-            counts[i] = _count_by_law(received, sensor, channel)[i]
+            counts[i] = _find_counts_by_noise_law(received, sensor, channel)[i]
         elif is_whole(wanted) and 2 <= wanted <= MOST:
             counts[i] = wanted
         else:
@@ -176,7 +180,9 @@ def stuck_counts(
     return None if np.all(np.isinf(counts)) else counts
 
 
-def _count_by_law(received: int, sensor: AnySensor | None, channel: Channel | None) -> Float[np.ndarray, " received"]:
+def _find_counts_by_noise_law(
+    received: int, sensor: AnySensor | None, channel: Channel | None
+) -> Float[np.ndarray, " received"]:
     """Return the counts by the noise and resolution of a sensor, the largest of all its steps."""
     steps = [step for step in unstack(sensor) if isinstance(step, AbstractSensor)]
     if not steps or channel is None:
@@ -185,7 +191,7 @@ def _count_by_law(received: int, sensor: AnySensor | None, channel: Channel | No
     for link in unstack(channel):
         if received != len(outputs) or not delivers_as_sent(link, outputs):
             raise fail("stuck", "a link that delivers readings as they are, or a number of equal readings", "True")
-    counts = np.max([longest_by_chance(bound_equal_readings(step.noise)) for step in steps], axis=0)
+    counts = np.max([longest_run_by_chance(bound_probability_of_equal_readings(step.noise)) for step in steps], axis=0)
     if np.any(counts > MOST):
         longest = ceil(np.max(counts))
         raise fail("stuck", f"noise that ends a run of equal readings before {MOST:,}", f"{longest:,}")

@@ -1,6 +1,5 @@
 """Sensors: y = h(x) + v."""
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -10,9 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.model.input_dependent_sensor import (
+    MeasureUnderInputs,
+    NoiseOfInputs,
+    count_matrix_rows,
+    read_function_of_state_alone,
+    read_input_names,
+    read_noise_of_inputs,
+    require_constant,
+)
 from heliograph.model.over_time import OverTime, first
-from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, NoiseFunction, OfInputs
-from heliograph.model.sensor_inputs import GivenInputs, NoiseOfInputs, count_rows, name_inputs, read_noise_of_inputs
+from heliograph.model.plant import AnyPlant, LinearPlant, MatrixFunction, MatrixOfInputs, NoiseFunction
 from heliograph.numerics.angle import Angles, angles_at, read_angles
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import (
@@ -137,15 +144,15 @@ class Sensor(AbstractSensor):
         inputs: "Names" = (),
     ):
         # A function of (x, u), with a noise that may depend on u too.
-        self.inputs = name_inputs(inputs)
+        self.inputs = read_input_names(inputs)
         if self.inputs:
             self.function = function("measure of a sensor", measure, "(x, u)")
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, None, self.inputs)
             self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_to(self.noise, resolution, self.circular)
+            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
             return
         # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
-        self.function, law = _take_state_alone(measure), _require_constant("sensor noise", noise)
+        self.function, law = read_function_of_state_alone(measure), require_constant("sensor noise", noise)
         count = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
         self.noise = as_noise("sensor noise", law, count)
         self.outputs = names("sensor outputs", outputs, count, "y")
@@ -156,7 +163,7 @@ class Sensor(AbstractSensor):
             expected = "one output, as a variance without names means (outputs=[...] names more)"
             raise fail("measure of a sensor", expected, f"shape {shape}")
         self.circular = read_angles("circular outputs", circular, self.outputs)
-        self.noise = _round_to(self.noise, resolution, self.circular)
+        self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return h(x); raise ValueError if the sensor depends on inputs."""
@@ -168,7 +175,7 @@ class Sensor(AbstractSensor):
         if not self.inputs:
             return self
         noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
-        return Sensor(GivenInputs(self.function, u), noise, self.outputs, self.circular)
+        return Sensor(MeasureUnderInputs(self.function, u), noise, self.outputs, self.circular)
 
 
 class LinearSensor(AbstractSensor):
@@ -185,7 +192,7 @@ class LinearSensor(AbstractSensor):
             none, functions of inputs without names.
     """
 
-    matrix: Float[jax.Array | np.ndarray, "m n"]  # or OfInputs, which refuses to be taken for an array
+    matrix: Float[jax.Array | np.ndarray, "m n"]  # or MatrixOfInputs, which refuses to be taken for an array
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
@@ -198,20 +205,20 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
-        self.inputs = name_inputs(inputs)
+        self.inputs = read_input_names(inputs)
         if self.inputs:
-            count = count_rows(matrix, self.inputs)  # C has a row for each output
+            count = count_matrix_rows(matrix, self.inputs)  # C has a row for each output
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, count, self.inputs)
-            C: Any = OfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
+            C: Any = MatrixOfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = C if callable(matrix) else array("sensor matrix", C, ("outputs", "states"))
             self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_to(self.noise, resolution, self.circular)
+            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
             return
-        self.matrix = array("sensor matrix", _require_constant("sensor matrix", matrix), ("outputs", "states"))
-        self.noise = as_noise("sensor noise", _require_constant("sensor noise", noise), self.matrix.shape[-2])
+        self.matrix = array("sensor matrix", require_constant("sensor matrix", matrix), ("outputs", "states"))
+        self.noise = as_noise("sensor noise", require_constant("sensor noise", noise), self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = read_angles("circular outputs", circular, self.outputs)
-        self.noise = _round_to(self.noise, resolution, self.circular)
+        self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """Return C x."""
@@ -223,7 +230,9 @@ class LinearSensor(AbstractSensor):
             return self
         matrix: Any = self.matrix
         noise = self.noise.given(u) if isinstance(self.noise, NoiseOfInputs) else self.noise
-        return LinearSensor(matrix(u) if isinstance(matrix, OfInputs) else matrix, noise, self.outputs, self.circular)
+        return LinearSensor(
+            matrix(u) if isinstance(matrix, MatrixOfInputs) else matrix, noise, self.outputs, self.circular
+        )
 
     def check_states(self, states: int) -> None:
         """Raise ValueError unless the matrix is for states of this length: to trace the function would take long."""
@@ -233,7 +242,9 @@ class LinearSensor(AbstractSensor):
             raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
 
 
-def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequence[str]) -> AbstractNoise:
+def _round_noise_to_resolution(
+    noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequence[str]
+) -> AbstractNoise:
     """Return the noise of a sensor that rounds to multiples of its resolution; the noise itself without one."""
     if resolution is None:
         return noise
@@ -253,29 +264,6 @@ def _round_to(noise: AbstractNoise, resolution: ArrayLike | None, circular: Sequ
 def _sensor_under_inputs(sensor: AbstractSensor, u: Array) -> AbstractSensor:
     """Return the sensor under its inputs u, computed in double precision."""
     return sensor.given(jnp.asarray(u))
-
-
-def _take_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
-    """Return a function of the state alone, refused where it needs anything else."""
-    checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
-    try:
-        signature = inspect.signature(checked)
-    except ValueError:  # of what is not Python, nothing is known before it is called
-        return checked
-    try:
-        signature.bind(None)
-    except TypeError:
-        expected = "a function of x alone, or inputs=[...], the names of those that a function of (x, u) takes"
-        raise fail("measure of a sensor", expected, f"one of {signature}") from None
-    return checked
-
-
-def _require_constant(name: str, value: object) -> Any:
-    """Return a constant; raise ValueError where it is a function of inputs that have no names."""
-    if callable(value):
-        expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
-        raise fail(name, expected, "a function")
-    return value
 
 
 def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, ...]:

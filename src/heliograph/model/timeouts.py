@@ -1,4 +1,4 @@
-"""Silences of a recording that are longer than the timeouts of its nodes."""
+"""Timeouts of nodes: the silences of a recording that are longer, by node."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -37,7 +37,7 @@ def describe_silence(quiet: float, timeout: float, unit: str) -> str:
     return f"nothing came for {quiet:g} {unit}".rstrip() + f", and its timeout is {timeout:g} {unit}".rstrip()
 
 
-def name_unit(inputs: Sequence[str]) -> str:
+def name_timeout_unit(inputs: Sequence[str]) -> str:
     """Return the unit in which timeouts are: "steps", or that of the plant's time; "" where that has none."""
     return units_in(inputs).get(TIME_STEP, "") if TIME_STEP in inputs else "steps"
 
@@ -73,6 +73,6 @@ def find_long_silences(
         is_long = lengths > timeout
         if is_long.any():
             found[node] = LongSilences(
-                timeout=timeout, rows=ends[:-1][is_long], lengths=lengths[is_long], unit=name_unit(names)
+                timeout=timeout, rows=ends[:-1][is_long], lengths=lengths[is_long], unit=name_timeout_unit(names)
             )
     return found

@@ -193,10 +193,10 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
-        self.delta, self.region = check_threshold(delta), one_of("region", region, Region)
+        self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
-        self.reference = one_of("reference", reference, Literal["sent", "acknowledged"])
-        self.losses = one_of("losses", losses, Losses)
+        self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
+        self.losses = read_choice("losses", losses, Losses)
 
 
 class SendOnPredictionError(AbstractThreshold):
@@ -221,9 +221,9 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
-        self.delta, self.region = check_threshold(delta), one_of("region", region, Region)
+        self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
-        self.losses, self.reference = one_of("losses", losses, Losses), "prediction"
+        self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
 
 
 class StochasticTrigger(AbstractTrigger):
@@ -255,8 +255,8 @@ class StochasticTrigger(AbstractTrigger):
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
-        self.reference = one_of("reference", reference, Literal["zero", "prediction"])
-        self.losses = one_of("losses", losses, Literal["unknown", "known"])
+        self.reference = read_choice("reference", reference, Literal["zero", "prediction"])
+        self.losses = read_choice("losses", losses, Literal["unknown", "known"])
         self.region, self.heartbeat = "box", None
 
     def matrix(self, outputs: int) -> jax.Array:
@@ -310,7 +310,7 @@ class Periodic(AbstractTrigger):
         return SendReason.SCHEDULE
 
 
-def check_threshold(delta: ArrayLike) -> Float[Array, "..."]:
+def read_threshold(delta: ArrayLike) -> Float[Array, "..."]:
     """Return a delta, which is positive, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
@@ -319,7 +319,7 @@ def check_threshold(delta: ArrayLike) -> Float[Array, "..."]:
     return checked
 
 
-def one_of(name: str, value: object, kinds: object) -> Any:
+def read_choice(name: str, value: object, kinds: object) -> Any:
     """Return a value that is one of the words of a type; refuse any other.
 
     Raises:

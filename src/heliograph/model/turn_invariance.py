@@ -1,4 +1,4 @@
-"""Whether a function of states knows that a full turn of an angle, or of an attitude, is none."""
+"""Whether a function of states returns the same after a full turn (2 pi) of an angle, or of an attitude."""
 
 from collections.abc import Callable, Sequence
 
@@ -20,7 +20,7 @@ SOME_TURN = (0.3, -0.2, 0.5)  # radians, about the three axes or of any states: 
 Turned = tuple[np.ndarray, Sequence[np.ndarray] | np.ndarray, tuple[np.ndarray, ...]]  # a state, its forms, the rest
 
 
-def check_turns(
+def check_turn_invariance(
     name: str,
     function: Callable[..., jax.Array],
     center: Vector,
@@ -53,7 +53,8 @@ def check_turns(
         at_both = [(center, center + turns, rest), (general_state, general_state + turns, ones)]
         _compare_turned(f"{name} with circular states", function, at_both, results)
     # Attitudes: by the other rotation vector of each.
-    others = [_turn_fully(general_state, given.rotations[i : i + 3]) for i in range(0, len(given.rotations), 3)]
+    attitudes = [given.rotations[i : i + 3] for i in range(0, len(given.rotations), 3)]
+    others = [_turn_attitude_long_way_round(general_state, places) for places in attitudes]
     if others:
         kind = f"{name} with an attitude (hg.models.turn_attitude turns one, hg.models.rotation_matrix has its axes)"
         _compare_turned(kind, function, [(general_state, others, ones)], results)
@@ -74,7 +75,7 @@ def _compare_turned(name: str, function: Callable[..., jax.Array], places: Seque
     by_point = [rest for (*_, rest), count in zip(places, counts, strict=True) for _ in range(count)]
     rests = tuple(np.stack(values) for values in zip(*by_point, strict=True))
     try:
-        found = np.asarray(compute_once(_values_at, _values_by_xla, (function, points, rests)))
+        found = np.asarray(compute_once(_evaluate_at_points, _values_by_xla, (function, points, rests)))
     except jax.errors.TracerArrayConversionError:  # the function holds a traced number
         return
     # Differences but for full turns, beyond the rounding of 2 pi in a steep function.
@@ -88,7 +89,7 @@ def _compare_turned(name: str, function: Callable[..., jax.Array], places: Seque
                 raise fail(name, "one that a full turn does not change", got)
 
 
-def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
+def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
     """Return the state with another rotation vector of the same attitude: the turn back, the long way round.
 
     Args:
@@ -101,9 +102,11 @@ def _turn_fully(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
     return other
 
 
-def _values_at(function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]) -> jax.Array:
+def _evaluate_at_points(
+    function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]
+) -> jax.Array:
     """Return f(x) at each of some points x, with further arguments (points, ...)."""
     return jnp.stack([jnp.asarray(function(x, *(values[i] for values in rests))) for i, x in enumerate(points)])
 
 
-_values_by_xla = quickly_compiled(_values_at)
+_values_by_xla = quickly_compiled(_evaluate_at_points)

@@ -29,7 +29,7 @@ from .vehicles import (
     coordinated_turn as coordinated_turn,
     unicycle as unicycle,
 )
-from .series import (
+from .time_series import (
     Component as Component,
     arma as arma,
     cycle as cycle,
@@ -41,8 +41,10 @@ from .series import (
     trigonometric_seasonal as trigonometric_seasonal,
 )
 from .joined_plants import (
-    Structural as Structural,
     join as join,
+)
+from .structural_time_series import (
+    Structural as Structural,
     structural as structural,
 )
 from .parts_of_estimates import (

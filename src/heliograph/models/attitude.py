@@ -25,7 +25,7 @@ def turn_attitude(attitude: Float[ArrayLike, "*any 3"], by: Float[ArrayLike, "*a
     Raises:
         ValueError: arrays of another shape.
     """
-    turned: Array = turn(_read_array("attitude", attitude, 3), _read_array("turn of an attitude", by, 3))
+    turned: Array = turn(_read_coordinates("attitude", attitude, 3), _read_coordinates("turn of an attitude", by, 3))
     return turned
 
 
@@ -38,7 +38,7 @@ def rotation_matrix(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 
     Raises:
         ValueError: an array of another shape.
     """
-    matrix: Array = matrix_of(_read_array("attitude", attitude, 3))
+    matrix: Array = matrix_of(_read_coordinates("attitude", attitude, 3))
     return matrix
 
 
@@ -51,7 +51,7 @@ def to_quaternion(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 4"
     Raises:
         ValueError: an array of another shape.
     """
-    quaternion: Array = quaternion_of(_read_array("attitude", attitude, 3))
+    quaternion: Array = quaternion_of(_read_coordinates("attitude", attitude, 3))
     return quaternion
 
 
@@ -64,7 +64,7 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
     Raises:
         ValueError: an array of another shape, a quaternion of length 0.
     """
-    values = _read_array("quaternion", quaternion, 4)
+    values = _read_coordinates("quaternion", quaternion, 4)
     largest = abs(values).max(axis=-1, keepdims=True)
     if not is_traced(values) and not largest.all():
         raise fail("quaternion", "four numbers of which one is not 0", "all of them 0")
@@ -72,7 +72,7 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
     return attitude
 
 
-def _read_array(name: str, value: ArrayLike, last: int) -> Any:
+def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
     """Return an array of JAX as it is, any other as doubles, NaN for what is missing; check its last axis."""
     if isinstance(value, jax.Array):
         read = value

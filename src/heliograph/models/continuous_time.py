@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.intervals import StateLimitsLike
+from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import TIME_STEP, LinearPlant
 from heliograph.numerics.check import array, covariance, fail, name_list, names, scalar
 from heliograph.numerics.module import Module, readable
@@ -63,7 +63,7 @@ def discretize(
 
     Source: Van Loan, Computing integrals involving the matrix exponential (1978), its integrals.
     """
-    model = _read_continuous(A, intensity, B)
+    model = _read_continuous_matrices(A, intensity, B)
     step = scalar("length of a step", dt, 0.0)
     return model.discretize_over(step)
 
@@ -91,7 +91,7 @@ class ContinuousSystem(Module):
         # F - I, F, the integral of F, and Q, doubled: by a loop of fixed length where `count` is traced.
         parts = growth, np.eye(len(a)) + growth, integral, noise
         if is_traced(parts, count):
-            parts = jax.lax.fori_loop(0, HALVINGS, _double_where(count), parts)
+            parts = jax.lax.fori_loop(0, HALVINGS, _make_masked_doubling(count), parts)
         else:
             for _ in range(int(count)):
                 parts = _double_step(*parts)
@@ -133,7 +133,7 @@ def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[A
     )
 
 
-def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
+def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
     """Return the turn of a loop that doubles `count` times and then leaves all as it is."""
 
     def double_if_left(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -146,7 +146,7 @@ def _double_where(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...
     return double_if_left
 
 
-def _read_continuous(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
+def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
     """Return A, B and the noise intensity as arrays of shapes that fit."""
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
@@ -216,7 +216,7 @@ def continuous_plant(
 
     Source: Van Loan, Computing integrals involving the matrix exponential (1978).
     """
-    model = _read_continuous(A, intensity, B)
+    model = _read_continuous_matrices(A, intensity, B)
     count = model.b.shape[1]
     named = names("input names", inputs, count, "u")
     # Steps of one length: constant matrices.
@@ -240,12 +240,12 @@ def continuous_plant(
         initial_covariance=initial_covariance,
         input_matrix=InputMatrixOverStep(model, count) if count else None,
         states=states,
-        inputs=with_time_step(named),
+        inputs=append_time_step(named),
         limits=limits,
     )
 
 
-def with_time_step(inputs: Names) -> list[str]:
+def append_time_step(inputs: Names) -> list[str]:
     """Return the names of inputs with "dt" behind them."""
     listed = name_list("input names", inputs)
     if TIME_STEP in listed:

@@ -84,7 +84,7 @@ class LocalPlane(Module):
         Raises:
             ValueError: an array of another shape.
         """
-        points = _read_array("position on a local plane", position, 3)
+        points = _read_coordinates("position on a local plane", position, 3)
         east, out, along = self._to_meridian(points)
         radius, _ = self._origin
         # r - r_0 = (east^2 + 2 r_0 out + out^2) / (r + r_0), without the difference of what is large.
@@ -104,7 +104,7 @@ class LocalPlane(Module):
         Raises:
             ValueError: an array of another shape.
         """
-        east, out, along = self._to_meridian(_read_array("position on a local plane", position, 3))
+        east, out, along = self._to_meridian(_read_coordinates("position on a local plane", position, 3))
         radius, above = self._origin
         c, s = np.cos(np.radians(self.longitude)), np.sin(np.radians(self.longitude))
         return np.stack([c * (radius + out) - s * east, s * (radius + out) + c * east, above + along], axis=-1)
@@ -118,7 +118,7 @@ class LocalPlane(Module):
         Raises:
             ValueError: an array of another shape.
         """
-        points = _read_array("earth-centred position", position, 3)
+        points = _read_coordinates("earth-centred position", position, 3)
         radius, above = self._origin
         c, s = np.cos(np.radians(self.longitude)), np.sin(np.radians(self.longitude))
         x, y, z = np.moveaxis(points, -1, 0)
@@ -141,7 +141,7 @@ class LocalPlane(Module):
             ValueError: arrays of another shape, or a latitude beyond 90 degrees.
         """
         phi, turn, _ = self._subtract_origin(latitude, longitude, self.height)
-        matrix = _read_array("covariance of positions", covariance, 3, 3)
+        matrix = _read_coordinates("covariance of positions", covariance, 3, 3)
         axes = _make_axes(
             np.radians(self.latitude) + phi, turn
         )  # rows east, north, up; columns out, east, along the axis
@@ -153,7 +153,7 @@ class LocalPlane(Module):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what points differ by from the origin: radians, radians from -pi to pi, metres."""
         named = {"latitude": latitude, "longitude": longitude, "height": height}
-        values = [_read_array(f"{name} of points", value) for name, value in named.items()]
+        values = [_read_coordinates(f"{name} of points", value) for name, value in named.items()]
         try:
             phi, turn, rise = np.broadcast_arrays(*values)
         except ValueError:
@@ -195,7 +195,7 @@ class LocalPlane(Module):
         return phi, rise
 
 
-def _read_array(name: str, value: ArrayLike, *last: int) -> np.ndarray:
+def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
     """Return numbers of any shape with these last axes; NaN is missing."""
     try:
         free = max(np.ndim(value) - len(last), 0)

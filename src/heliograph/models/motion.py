@@ -96,7 +96,7 @@ def singer(
 
     Source: Singer, Estimating optimal tracking filter performance for manned maneuvering targets (1970).
     """
-    size, rate = _deviation_and_rate(deviation, time)
+    size, rate = _read_deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])
     return _repeat_on_axes(
@@ -125,11 +125,11 @@ def gauss_markov(
 
     Source: Gelb, Applied optimal estimation (1974), 3.8.
     """
-    size, rate = _deviation_and_rate(deviation, time)
+    size, rate = _read_deviation_and_rate(deviation, time)
     named = name_list("states", states)
     eye = np.eye(len(named))
     return continuous_plant(
-        -rate * eye, 2 * size**2 * rate * eye, np.zeros(len(named)), size**2 * eye, dt=dt, states=_with_units(named)
+        -rate * eye, 2 * size**2 * rate * eye, np.zeros(len(named)), size**2 * eye, dt=dt, states=_keep_units(named)
     )
 
 
@@ -161,14 +161,14 @@ def known_turn(
     rate, q = scalar("turn rate", turn_rate), scalar("noise intensity", intensity, 0.0)
     motion = library(rate).asarray([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, -rate], [0.0, 0.0, 0.0, 1.0],
                                     [0.0, rate, 0.0, 0.0]])  # fmt: skip
-    named = two_axes(axes)
+    named = read_two_axes(axes)
     mean = np.zeros(4) if initial_mean is None else initial_mean
     start = WIDE * np.eye(4) if initial_covariance is None else initial_covariance
-    states = _with_units(_name_states(named, 2))
+    states = _keep_units(_name_states(named, 2))
     return continuous_plant(motion, q * np.diag([0.0, 1.0, 0.0, 1.0]), mean, start, dt=dt, states=states)
 
 
-def two_axes(axes: Names) -> list[str]:
+def read_two_axes(axes: Names) -> list[str]:
     """Return the names of two axes.
 
     Raises:
@@ -180,7 +180,7 @@ def two_axes(axes: Names) -> list[str]:
     return named
 
 
-def _deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
+def _read_deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
     """Return a deviation, checked, and the rate 1 / time at which it is forgotten."""
     return scalar("deviation", deviation, 0.0, LARGEST), 1 / scalar("time", time, 1 / LARGEST)
 
@@ -200,7 +200,7 @@ def _name_states(axes: Sequence[str], order: int) -> list[str]:
     return named
 
 
-def _with_units(states: Sequence[str]) -> Sequence[str]:
+def _keep_units(states: Sequence[str]) -> Sequence[str]:
     """Return names whose units, where they have some, stay with them."""
     return [rename(name, str(name)) for name in states]
 

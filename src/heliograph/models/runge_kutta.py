@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.intervals import StateLimitsLike
+from heliograph.model.limit_arguments import StateLimitsLike
 from heliograph.model.plant import Plant, check_shape
-from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, with_time_step
+from heliograph.models.continuous_time import ContinuousSystem, Drift, Number, Square, Start, append_time_step
 from heliograph.numerics.check import array, check_count, covariance, function, name_list, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import as_real
@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array, Names
 from heliograph.random_affine.noise import NoiseLike
 
 
-class MotionOverStep(Module):
+class DriftAndStepLength(Module):
     """dx/dt = f(x, u), and the length of a step: a number, or the last input."""
 
     drift: Drift
@@ -29,7 +29,7 @@ class MotionOverStep(Module):
         return (u, self.dt) if self.dt is not None else (u[:-1], u[-1])
 
 
-class RungeKuttaStep(MotionOverStep):
+class RungeKuttaStep(DriftAndStepLength):
     """The classical step of Runge and Kutta: local error of order dt^5."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -52,7 +52,7 @@ class RungeKuttaStep(MotionOverStep):
         return moved
 
 
-class LinearizedNoise(MotionOverStep):
+class LinearizedNoise(DriftAndStepLength):
     """Q of a step: the intensity spread by the Jacobian of f at one state."""
 
     intensity: Array
@@ -117,7 +117,7 @@ def runge_kutta_plant(
         initial_mean=mean,
         initial_covariance=initial_covariance,
         states=states,
-        inputs=inputs_of_drift if step is not None else with_time_step(inputs_of_drift),
+        inputs=inputs_of_drift if step is not None else append_time_step(inputs_of_drift),
         circular=[str(name) for name in name_list("circular states", circular)],
         limits=limits,
     )

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.plant import Plant
-from heliograph.models.continuous_time import with_time_step
-from heliograph.models.motion import two_axes
+from heliograph.models.continuous_time import append_time_step
+from heliograph.models.motion import read_two_axes
 from heliograph.numerics.check import TINY, covariance, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
@@ -74,7 +74,7 @@ class ArcMotion(StepLength):
         return jnp.asarray(x + moved)
 
 
-class ScaledNoise(StepLength):
+class NoiseTimesStep(StepLength):
     """Q = S dt."""
 
     intensity: Array
@@ -123,10 +123,10 @@ def coordinated_turn(
     Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking (2001), 11.7.2.
     """
     q, wander = scalar("noise intensity", intensity, 0.0), scalar("intensity of the turn rate", turn_intensity, 0.0)
-    first, second = two_axes(axes)
+    first, second = read_two_axes(axes)
     step = None if dt is None else scalar("length of a step", dt, 0.0)
     states = [first, f"{first}_velocity", second, f"{second}_velocity", "turn_rate"]
-    inputs = [] if dt is not None else with_time_step(())
+    inputs = [] if dt is not None else append_time_step(())
     noise = TurnNoise(step, q, wander)
     return Plant(TurnMotion(step), noise, initial_mean, initial_covariance, states=states, inputs=inputs)
 
@@ -215,10 +215,10 @@ def _make_vehicle_plant(
     inputs = ["speed", steered_by]
     return Plant(
         transition=ArcMotion(step, wheelbase),
-        noise=ScaledNoise(step, spread) if step is None else spread * step,
+        noise=NoiseTimesStep(step, spread) if step is None else spread * step,
         initial_mean=initial_mean,
         initial_covariance=initial_covariance,
-        states=[*two_axes(axes), "heading"],
-        inputs=with_time_step(inputs) if step is None else inputs,
+        states=[*read_two_axes(axes), "heading"],
+        inputs=append_time_step(inputs) if step is None else inputs,
         circular=["heading"],
     )

@@ -145,6 +145,7 @@ from .times.data_row_checks import check_rows as check_rows
 from .times.dates import MISSING as MISSING
 from .times.dates import UNITS as UNITS
 from .times.dates import format_dates as format_dates
+from .times.dates import format_times as format_times
 from .times.dates import horizons_in as horizons_in
 from .times.dates import looks_like_date as looks_like_date
 from .times.dates import parse_dates as parse_dates

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from heliograph.filters.linear.linear import linear_filter
+from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, fail, instance, table

@@ -11,8 +11,8 @@ from heliograph.linear.jump_system import propagate_by_mode
 from heliograph.linear.lmmse_recursion import lmmse
 from heliograph.linear.system import Gains, LinearSystem, Schedule
 from heliograph.linear.system import Steps as SystemSteps
-from heliograph.model.estimate import lower_by_noise
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.estimate import lower_claim_by_noise
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.relays import RECEIVER, RelayNetwork, RelaySteps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compile_in_float64
@@ -158,10 +158,10 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
             predicted=predicted[:, error, error],
             innovation=predicted[:, d:, d:][:, received, received],
         )
-        schedules[name] = Schedule(gains, start_mean, lower_by_noise("exact", network))
+        schedules[name] = Schedule(gains, start_mean, lower_claim_by_noise("exact", network))
     relayed = {name: schedules[name].gains.gain for name in network.relays}
     premise = Premise(network.plant, relays=network, gains=relayed)
-    return {name: on_premise(schedule, premise) for name, schedule in schedules.items()}
+    return {name: with_premise(schedule, premise) for name, schedule in schedules.items()}
 
 
 def _make_gains(
@@ -258,7 +258,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
-    return lmmse(receiver_system(network, gains), lower_by_noise("exact", network))
+    return lmmse(receiver_system(network, gains), lower_claim_by_noise("exact", network))
 
 
 def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
@@ -306,7 +306,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
         for name, size, end in zip(network.relays, network.received, ends, strict=False)
     }
     x_of_state = np.eye(n, d + r)
-    return on_premise(
+    return with_premise(
         LinearSystem(system, mean, covariance, x_of_state),
         Premise(network.plant, relays=network, gains=relayed),
     )

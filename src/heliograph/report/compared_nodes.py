@@ -5,7 +5,7 @@ from scipy.special import ndtri
 
 import heliograph
 from heliograph.filters.base import AbstractFilter
-from heliograph.model.enlarged.joint_sensors import join_links
+from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor

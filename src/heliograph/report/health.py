@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import ndtri
 
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.plant import TIME_STEP
 from heliograph.model.timeouts import LongSilences, find_long_silences
 from heliograph.numerics.check import array, fail, instance
@@ -34,8 +34,8 @@ from heliograph.report.forecasts import Forecasts, Residuals
 from heliograph.report.outputs import ListeningFilter, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
 from heliograph.report.repeated_values import HeldValue
 from heliograph.report.time_unit import doubt_time_unit
-from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
-from heliograph.simulation.description.possible import doubt_estimates
+from heliograph.simulation.declared_noise.judgement import DeclaredJudgement, judge_declared_links
+from heliograph.simulation.description.doubtful_estimates import doubt_estimates
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, score_innovations

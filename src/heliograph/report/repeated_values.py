@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import erf
 
 from heliograph.model.over_time import first
-from heliograph.model.repeated_readings import delivers_as_sent, longest_by_chance
+from heliograph.model.repeated_readings import delivers_as_sent, longest_run_by_chance
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
@@ -127,7 +127,7 @@ def find_held_value(
         first_row=int(rows[start]),
         readings=length,
         received=len(received),
-        stuck=int(longest_by_chance(np.array(p))),
+        stuck=int(longest_run_by_chance(np.array(p))),
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from heliograph.live.event import VERDICTS
-from heliograph.model.checks.refusals import OF_NODES, Reason
+from heliograph.model.checks.refusal_reasons import OF_NODES, Reason
 
 COUNTS = (*VERDICTS, *OF_NODES, "timeouts", "held")  # which never fall
 FIELDS = (*COUNTS, "lost")

@@ -10,7 +10,7 @@ from pydantic_core import to_json
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.network_program import NetworkProgram
 from heliograph.numerics.types import Float
-from heliograph.simulation.rows.columns import FilterColumns
+from heliograph.simulation.rows.output_columns import FilterColumns
 
 HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
 FIRST = 2**52  # the number of column 0 where a row holds column numbers: no name contains it

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapte
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 from typing_extensions import TypeAliasType
 
-from heliograph.model.checks.refusals import Reason
+from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.dates import parse_instant
 

@@ -8,7 +8,7 @@ from typing_extensions import TypeAliasType
 
 import heliograph
 from heliograph.model.forecast_origin import HasOrigin
-from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, show_value
 from heliograph.simulation.network import Network

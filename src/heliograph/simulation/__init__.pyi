@@ -3,7 +3,7 @@
 from .transmission.recorded_signal import (
     arrivals as arrivals,
 )
-from .centres.before_data import (
+from .centres.cross_covariances import (
     CrossCovariances as CrossCovariances,
     cross_covariances as cross_covariances,
     fused_covariances as fused_covariances,
@@ -15,31 +15,31 @@ from .centres.mesh_errors import (
     mesh_arrivals as mesh_arrivals,
     mesh_errors as mesh_errors,
 )
-from .centres.mesh_mean import (
+from .centres.mesh_mean_errors import (
     mean_mesh_errors as mean_mesh_errors,
 )
 from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,
 )
-from .declared.judgement import (
+from .declared_noise.judgement import (
     DeclaredBias as DeclaredBias,
     DeclaredClass as DeclaredClass,
     DeclaredJudgement as DeclaredJudgement,
     judge_declared as judge_declared,
     judge_declared_links as judge_declared_links,
 )
-from .description.wide_angles import (
+from .description.angle_doubts import (
     WideAngles as WideAngles,
 )
-from .description.possible import (
+from .description.doubtful_estimates import (
     doubt_estimates as doubt_estimates,
 )
 from .description.doubts import (
     Doubt as Doubt,
     doubts_before_data as doubts_before_data,
 )
-from .rows.columns import (
+from .rows.output_columns import (
     FilterColumns as FilterColumns,
 )
 from .rows.row_smoother import (
@@ -51,7 +51,7 @@ from .rows.row_step import (
 from .runs.compilation_cache import (
     keep_compilations as keep_compilations,
 )
-from .runs.over_runs import (
+from .runs.map_over_runs import (
     over_runs as over_runs,
 )
 from .results.reducer import (
@@ -59,7 +59,7 @@ from .results.reducer import (
     OfStep as OfStep,
     Trajectories as Trajectories,
 )
-from .stepping import (
+from .network_filters import (
     centre_filter as centre_filter,
 )
 from .centres.uplinks import (
@@ -85,7 +85,7 @@ from .results.statistics import (
 from .results.error_sums import (
     error_statistics as error_statistics,
 )
-from .results.statistics_by_name import (
+from .results.error_statistics_by_name import (
     StatisticsByName as StatisticsByName,
 )
 from .results.consistency import (

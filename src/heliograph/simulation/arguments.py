@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.numerics.check import array, check_columns, check_seed, fail, rank, show_value
 from heliograph.numerics.random_keys import seed_key
 from heliograph.numerics.types import ArrayLike

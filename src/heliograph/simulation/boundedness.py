@@ -109,7 +109,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     # on the modes that do not decay is known, of which there are more.
     growing = _find_unstable_modes(a)
     for space in (np.eye(len(a)), growing):
-        known = _group_losses(a, q, links, space)
+        known = _find_usable_measurements(a, q, links, space)
         gains = find_gains(known.system)
         radius = certify_radius(known.system, gains)
         if radius < BELOW_ONE:
@@ -124,7 +124,7 @@ def certify_boundedness(network: Network) -> Boundedness:
             )
     # Not certified. From here on `known` is of the modes that do not decay: do losses hide one of them?
     unseen = find_fastest_unobserved_mode(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
-    verdict, reason = _judge_unseen(network, links, growing, known, unseen, radius)
+    verdict, reason = _judge_unobserved_modes(network, links, growing, known, unseen, radius)
     return Boundedness(
         verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=known.map_gains(gains), bound=None
     )
@@ -144,13 +144,14 @@ def _join_links(network: Network, states: int) -> JointLinks:
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
-    channels = [_require_constant(node.channel) for node in nodes]
+    channels = [_read_constant_channel(node.channel) for node in nodes]
     # Channels in parallel, as one chain of modes.
     joint = parallel(channels) if len(channels) > 1 else channels[0]
     for memory in memories(joint).values():
         if memory.is_uncertain:
             raise fail("chain of a channel", "one of known transition", "one whose probabilities are uncertain")
-    modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
+    # A drifting gain is put on a grid of two values: enough to know that it is random.
+    modes = joint_modes(joint, 2)
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
     # Modes that can occur. Entry j of p (I + T)^M, with p the initial law, T the chain and M its number of modes, sums
     # the weights of all ways to mode j in at most M steps; it is positive if there is one.
@@ -165,7 +166,7 @@ def _join_links(network: Network, states: int) -> JointLinks:
     )
 
 
-def _require_constant(channel: Channel) -> AbstractRandomAffine:
+def _read_constant_channel(channel: Channel) -> AbstractRandomAffine:
     """Return a channel that neither varies nor delays as it is; raise ValueError for another."""
     if isinstance(channel, OverTime):
         raise fail("channel", "one that does not vary", "one that varies")
@@ -180,8 +181,8 @@ def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, 
     return np.asarray(basis[:, :count])
 
 
-class KnownLosses(NamedTuple):
-    """Usable measurements of a receiver, by kind of losses.
+class UsableMeasurements(NamedTuple):
+    """What a receiver can use of its measurements: sums of known gain, by the kind of losses that it sees.
 
     Args:
         system: the plant, measured by sums of what arrives.
@@ -208,7 +209,9 @@ class KnownLosses(NamedTuple):
         return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
-def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]) -> KnownLosses:
+def _find_usable_measurements(
+    a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[np.ndarray, "n d"]
+) -> UsableMeasurements:
     """Return what a receiver can use in each kind of losses: the sums of what arrives of known gain on a subspace of x.
 
     A kind of losses is a pattern of which components arrive, all that the receiver sees of the channel's mode. Gains
@@ -239,7 +242,7 @@ def _group_losses(a: np.ndarray, q: np.ndarray, links: JointLinks, space: Float[
         parts[kind].find_noise_of_sums(outcome, links) for outcome, kind in zip(outcomes, kind_of_outcome, strict=True)
     )
     system = KnownLossSystem(a, q, chain, law, kind_of_outcome, tuple(part.rows for part in parts), noises)
-    return KnownLosses(system, kinds, parts)
+    return UsableMeasurements(system, kinds, parts)
 
 
 class KnownGainSums(NamedTuple):
@@ -317,11 +320,11 @@ def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
 
 
-def _judge_unseen(
+def _judge_unobserved_modes(
     network: Network,
     links: JointLinks,
     growing: np.ndarray,
-    known: KnownLosses,
+    known: UsableMeasurements,
     unseen: UnobservedGrowth,
     radius: float,
 ) -> tuple[Verdict, str]:
@@ -338,13 +341,13 @@ def _judge_unseen(
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
-    reason = _explain_growth(links, known.system, unseen)
-    if not _is_excited(network, growing, known, unseen):
+    reason = _explain_unbounded_error(links, known.system, unseen)
+    if not _is_mode_excited(network, growing, known, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
 
-def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
+def _explain_unbounded_error(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
     """Return why no filter's error can stay bounded, in words: the plant's mode, and why nothing received shows it."""
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
@@ -361,7 +364,9 @@ def _explain_growth(links: JointLinks, system: KnownLossSystem, unseen: Unobserv
     return f"{mode} is not seen at all"
 
 
-def _is_excited(network: Network, growing: np.ndarray, known: KnownLosses, unseen: UnobservedGrowth) -> bool:
+def _is_mode_excited(
+    network: Network, growing: np.ndarray, known: UsableMeasurements, unseen: UnobservedGrowth
+) -> bool:
     """Return whether P stays above eps v v' for some eps > 0: noise keeps exciting the unseen eigenvector v.
 
     So it is if noise enters along v at once, or reaches it and every measurement has noise. The noise of random gains

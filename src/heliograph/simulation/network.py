@@ -25,27 +25,27 @@ from heliograph.numerics.module import Module, readable
 from heliograph.random_affine.base import check_forgets
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.simulation.centres.mesh_check import check_mesh
-from heliograph.simulation.channel_flags import check_flags
-from heliograph.simulation.claims import (
-    OtherBelief,
+from heliograph.simulation.covariance_claims import (
+    MistakenBelief,
     find_claims,
-    list_other_beliefs,
     lower_claim,
     lower_claims_of_central_filters,
     lower_claims_of_nodes,
     make_fusions_nominal,
     make_nodes_nominal,
     pad_filters_alike,
+    yield_mistaken_beliefs,
 )
-from heliograph.simulation.description.diagram import short_text_of, text_of, write_html_table
+from heliograph.simulation.description.diagram import write_diagram, write_html_table, write_short_diagram
+from heliograph.simulation.mode_flag_check import check_flags
 from heliograph.simulation.network_index import (
+    AlikeFilters,
     EstimatePlace,
-    FilterKind,
     find_estimate_places,
+    find_rows_of_nodes,
     group_by_structure,
-    join_rows,
-    list_kinds,
-    list_mesh_kinds,
+    list_alike_filters,
+    list_alike_meshes,
 )
 from heliograph.simulation.node import FUSED as FUSED
 from heliograph.simulation.node import (
@@ -56,7 +56,7 @@ from heliograph.simulation.node import (
     check_filters,
     check_received,
     check_states,
-    describe_received,
+    get_parts_of_reception,
 )
 from heliograph.simulation.sender_checks import check_type
 
@@ -100,8 +100,8 @@ class Network(Module):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
-    kinds: tuple[FilterKind, ...] = eqx.field(static=True)
-    mesh_kinds: tuple[FilterKind, ...] = eqx.field(static=True)  # of meshes, sorted as in compiled code
+    kinds: tuple[AlikeFilters, ...] = eqx.field(static=True)
+    mesh_kinds: tuple[AlikeFilters, ...] = eqx.field(static=True)  # of meshes, sorted as in compiled code
     places: FrozenMapping[tuple[str, str], EstimatePlace] = eqx.field(static=True)  # by node and filter
     rows: FrozenMapping[str, range] = eqx.field(static=True)  # among all measurements, joined in the order of the nodes
     claimed: FrozenMapping[tuple[str, str], Claim] = eqx.field(static=True)  # by node and filter, fused ones last
@@ -131,17 +131,17 @@ class Network(Module):
             raise fail("network", "at least one node", "none")
         self.states, self.inputs = first(plant).states, first(plant).inputs
         self._check_nodes()
-        self.rows = FrozenMapping(join_rows({name: node.received for name, node in self.nodes.items()}))
+        self.rows = FrozenMapping(find_rows_of_nodes({name: node.received for name, node in self.nodes.items()}))
         # Filters that believe another world than their node's claim less; arrays get one length, so that they stack.
         self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
         # Groups of nodes and kinds of filters, by structure.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
-            (name, without_output_names((describe_received(n), n.filters, meshes[name])))
+            (name, without_output_names((get_parts_of_reception(n), n.filters, meshes[name])))
             for name, n in self.nodes.items()
         )
-        self.kinds = list_kinds(self.groups, {name: node.filters for name, node in self.nodes.items()})
-        self.mesh_kinds = list_mesh_kinds(self.groups, meshes)
+        self.kinds = list_alike_filters(self.groups, {name: node.filters for name, node in self.nodes.items()})
+        self.mesh_kinds = list_alike_meshes(self.groups, meshes)
         self.places = FrozenMapping(find_estimate_places(self.groups, self.kinds))
         # Links and fusions, which are checked by group.
         self._check_links()
@@ -323,7 +323,7 @@ class Network(Module):
 
     def diagram(self) -> str:
         """Return all of the network as lines of text, of which `repr` shows the first."""
-        return text_of(self)
+        return write_diagram(self)
 
     def claims(self) -> Claims:
         """Return the claim of every estimate, by node and filter; fused ones last, under "fused"."""
@@ -332,9 +332,9 @@ class Network(Module):
             claims[node][name] = claim
         return claims
 
-    def beliefs(self) -> tuple[OtherBelief, ...]:
+    def beliefs(self) -> tuple[MistakenBelief, ...]:
         """Return filters that believe another world than their place's, node after node, fused ones last."""
-        return tuple(list_other_beliefs(self))
+        return tuple(yield_mistaken_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
         """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""
@@ -361,5 +361,5 @@ class Network(Module):
 
 
 readable(Network)
-Network.__repr__ = short_text_of  # type: ignore[method-assign, assignment]
+Network.__repr__ = write_short_diagram  # type: ignore[method-assign, assignment]
 Network._repr_html_ = write_html_table  # type: ignore[attr-defined]

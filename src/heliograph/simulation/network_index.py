@@ -9,8 +9,8 @@ import numpy as np
 from heliograph.model.over_time import structure_key
 
 
-class FilterKind(NamedTuple):
-    """Filters that differ in numbers alone: `filters` of the nodes of one group."""
+class AlikeFilters(NamedTuple):
+    """Filters that differ in numbers alone, one kind: those of the names `filters` at the nodes of one group."""
 
     group: int
     filters: tuple[str, ...]
@@ -25,7 +25,7 @@ class EstimatePlace(NamedTuple):
 
 
 def find_estimate_places(
-    groups: Sequence[Sequence[str]], kinds: Sequence[FilterKind]
+    groups: Sequence[Sequence[str]], kinds: Sequence[AlikeFilters]
 ) -> dict[tuple[str, str], EstimatePlace]:
     """Return the place of each estimate, by node and filter."""
     return {
@@ -44,22 +44,26 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
     return tuple(tuple(names) for names in results.values())
 
 
-def list_kinds(groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]) -> tuple[FilterKind, ...]:
+def list_alike_filters(
+    groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]
+) -> tuple[AlikeFilters, ...]:
     """Return the kinds of filters, group after group; `filters` are those of each node, which are alike in a group."""
     return tuple(
-        FilterKind(g, alike)
+        AlikeFilters(g, alike)
         for g, names in enumerate(groups)
         for alike in group_by_structure(filters[names[0]].items())
     )
 
 
-def list_mesh_kinds(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[FilterKind, ...]:
+def list_alike_meshes(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[AlikeFilters, ...]:
     """Return the kinds of fusions between neighbours, sorted as in compiled code; `meshes` are those of each node."""
     every = sorted({mesh for of_node in meshes.values() for mesh in of_node})
-    return tuple(FilterKind(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]])
+    return tuple(
+        AlikeFilters(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]]
+    )
 
 
-def join_rows(received: Mapping[str, int]) -> dict[str, range]:
+def find_rows_of_nodes(received: Mapping[str, int]) -> dict[str, range]:
     """Return where each node's measurements stand among all, joined in this order; `received` says how many it has."""
     ends = accumulate(received.values())
     return {name: range(end - size, end) for (name, size), end in zip(received.items(), ends, strict=True)}

@@ -9,25 +9,25 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel, check_sent
+from heliograph.model.channel_side_information import name_received_values
 from heliograph.model.estimate import Claim
-from heliograph.model.limits import Limits, LimitsLike, make_limits
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.reading_limits import LimitsLike, ReadingLimits, make_limits
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.repeated_readings import StuckLike
-from heliograph.model.reported_numbers import name_received
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.model.trigger import AbstractTrigger
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.word_channel import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_carried_components
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.check import TINY, fail, scalar, table
 from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memories_of_channels import drop_names
-from heliograph.simulation.channel_flags import check_flags
+from heliograph.random_affine.memory import drop_names
+from heliograph.simulation.mode_flag_check import check_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,
     check_trigger,
@@ -75,7 +75,7 @@ class Node(Module):
     sensor: AnySensor
     channel: Channel
     filters: dict[str, AbstractFilter]
-    limits: Limits | None
+    limits: ReadingLimits | None
     timeout: float | None = eqx.field(static=True)
     trigger: AbstractTrigger | None
     encoder: Words | None
@@ -114,10 +114,10 @@ class Node(Module):
         self.complete = not first(channel).erases and trigger is None
         check_filters(self.filters, self.received)
         self.limits = make_limits(self.received, limits, invalid, stuck, self.sensor, self.channel)
-        # Flags of the step that each filter's model has. A sensor with feedback sends what the informed filter did not
-        # predict: no other filter could use that.
+        # A channel may deliver a flag of its mode beside the measurement: refused unless the filter's model has it too.
         for name, filter in self.filters.items():
             check_flags(f"filter {name!r}", filter, [first(channel)])
+        # A sensor with feedback sends what the informed filter did not predict: no other filter could use that.
         receiving = [name for name, filter in self.filters.items() if filter.received]
         if self.informed_by is not None and receiving != [self.informed_by]:
             expected = f"no filter with measurements besides {self.informed_by!r}"
@@ -150,9 +150,9 @@ class Node(Module):
         """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT"."""
         channel = first(self.channel)
         if self.encoder is None or not self.encoder.subtracts:
-            return name_received(self.outputs, channel, self.received - channel.outputs)
-        dithers = [f"dither_{self.outputs[place]}" for place in find_places(channel) if place != FLAG]
-        values = name_received(self.outputs, channel, self.received - channel.outputs - len(dithers))
+            return name_received_values(self.outputs, channel, self.received - channel.outputs)
+        dithers = [f"dither_{self.outputs[place]}" for place in find_carried_components(channel) if place != FLAG]
+        values = name_received_values(self.outputs, channel, self.received - channel.outputs - len(dithers))
         # Of an output that arrives several times, such as over two links, the dithers are numbered.
         several = {name for name in dithers if dithers.count(name) > 1}
         return values + tuple(
@@ -313,10 +313,10 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
             check_received(f"filter {name!r}", filter, received)
 
 
-def describe_received(node: Node | ReceivingNode) -> object:
+def get_parts_of_reception(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements; nodes where their structure is one are a group."""
     if isinstance(node, Node):
-        places = None if node.encoder is None else find_places(node.channel)
+        places = None if node.encoder is None else find_carried_components(node.channel)
         link = drop_names(node.channel)
         return node.sensor, link, node.informed_by, node.trigger, node.encoder, places, node.predictor
     return node.received, node.complete

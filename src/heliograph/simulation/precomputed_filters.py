@@ -11,49 +11,49 @@ from heliograph.engine.choice import choose_code, compute_once, map_arrays
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.simulation.runs.side_by_side import StackedFilters, map_all
-from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_steps
+from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters, map_all
+from heliograph.smoothing.backward_pass import plan_with_past
 
 
-def plan_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
+def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
-    planned = [_plan_stack(a, u) if filters.complete[a.group] else a for a in filters.alike]
+    planned = [_precompute_stack(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = filters.central if all(filters.complete) else {}
     central = {
-        name: compute_once(_plan_filter, _planned_by_xla, (filter, u, filters.smooths))
+        name: compute_once(_precompute_filter, _precompute_by_xla, (filter, u, filters.smooths))
         for name, filter in central.items()
     }
     changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
     return cast(AllFilters, to_numpy(changed))
 
 
-def _plan_stack(alike: StackedFilters, u: Array) -> StackedFilters:
+def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
     """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
-        choice = choose_code(_plan_filter, arguments, (True, False, False))
+        choice = choose_code(_precompute_filter, arguments, (True, False, False))
         if choice.code is None:
-            return replace(alike, filters=to_numpy(_all_planned_by_xla(*arguments, count)))
+            return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 
 
-def _plan_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
+def _precompute_filter(filter: AbstractFilter, u: Array, smooths: bool) -> AbstractFilter:
     """Return a filter planned for inputs u, also for smoothing where it `smooths`."""
     return plan_with_smoother_steps(filter, u) if smooths else filter.planned(u)
 
 
-_planned_by_xla = quickly_compiled(_plan_filter)
+_precompute_by_xla = quickly_compiled(_precompute_filter)
 
 
 @quickly_compiled
-def _all_planned_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
+def _precompute_all_by_xla(filters: AbstractFilter, u: Array, smooths: bool, count: int) -> PyTree:
     """Return `count` stacked filters, each planned for inputs u."""
-    return map_all(lambda filter: _plan_filter(filter, u, smooths), count)(filters)
+    return map_all(lambda filter: _precompute_filter(filter, u, smooths), count)(filters)
 
 
-def has_plan(filters: AllFilters) -> bool:
+def can_precompute(filters: AllFilters) -> bool:
     """Return whether some filter has anything to precompute: a `planned` of its own."""
     every = [*(stacked.filters for stacked in filters.alike), *filters.central.values()]
     return any(type(filter).planned is not AbstractFilter.planned for filter in every)

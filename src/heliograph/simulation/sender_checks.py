@@ -11,7 +11,7 @@ from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.word_channel import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_carried_components
 from heliograph.numerics.check import fail, show_value
 from heliograph.random_affine.base import AbstractRandomAffine, all_inner_maps
 from heliograph.random_affine.words.bit_flips import Flips
@@ -85,7 +85,7 @@ def check_encoder(
         raise fail("encoder", "a sensor without angles", list(sensor.circular))
     if any(isinstance(filter, FedBackFilter) for filter in filters.values()):
         raise fail("encoder", "no filter that is fed back", "one")
-    find_places(channel)  # raises where words are amplified
+    find_carried_components(channel)  # raises where words are amplified
     # A trigger that compares values compares words, which both ends must share. A periodic one compares nothing.
     if trigger is not None and not isinstance(trigger, Periodic):
         if encoder.subtracts:
@@ -97,7 +97,7 @@ def check_encoder(
 
 def count_subtracted_dithers(encoder: Words, channel: Channel) -> int:
     """Return how many dithers a receiver is told to subtract: one for each component that arrives but flags."""
-    return sum(place != FLAG for place in find_places(channel)) if encoder.subtracts else 0
+    return sum(place != FLAG for place in find_carried_components(channel)) if encoder.subtracts else 0
 
 
 def flips_words(channel: AbstractRandomAffine) -> bool:

@@ -22,13 +22,13 @@ from heliograph.random_affine.memories_of_channels import number_unnamed_memorie
 from heliograph.simulation.arguments import Precision, check_precision, make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh_building import build_meshes
 from heliograph.simulation.network import Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.node import Node
-from heliograph.simulation.precomputed_filters import has_plan, plan_filters
-from heliograph.simulation.results.no_numbers import warn_of_no_numbers
+from heliograph.simulation.precomputed_filters import can_precompute, precompute_filters
+from heliograph.simulation.results.non_finite_warnings import warn_of_non_finite_numbers
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories
 from heliograph.simulation.results.statistics import BATCHES
-from heliograph.simulation.runs.by_run import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.runs.lanes import (
     LANES,
     RunLanes,
@@ -42,9 +42,9 @@ from heliograph.simulation.runs.lanes import (
 )
 from heliograph.simulation.runs.memory import NeededMemory, check_memory, count_bytes, explain_out_of_memory
 from heliograph.simulation.runs.native import simulate_natively
+from heliograph.simulation.runs.xla_runs import apply_to_each_run, list_used_leaves, simulate_trajectories
 from heliograph.simulation.simulation_step import World
 from heliograph.simulation.smoothed import NetworkSmoother, ReducedRuns, finish_result, reduce_run, select_smoothed_part
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing
 
@@ -116,10 +116,10 @@ def monte_carlo(
                 network, u, base, reducer, first_run, runs, chunk, progress, smoothing, precision
             )
         if by_native_code is not None:
-            return _warn_of_invalid_numbers(by_native_code, network)
+            return _return_with_warnings(by_native_code, network)
     # Otherwise XLA: the world, with gains computed beforehand where they depend on no data, and what is collected.
     filters = AllFilters(network, None if smoothing is None else smoothing.kinds)
-    planned = plan_filters(filters, u) if has_plan(filters) else filters
+    planned = precompute_filters(filters, u) if can_precompute(filters) else filters
     job = _SimulationJob(
         world=World(number_unnamed_memories(network.plant), make_reception(network), planned),
         later=None if smoothing is None else smoothing.smoother(filters),
@@ -133,20 +133,20 @@ def monte_carlo(
         check_memory(_estimate_memory(job, runs, chunk), runs, horizon)
     with explain_out_of_memory(runs, horizon):
         recorded = _run_chunks(job, first_run, runs, chunk, progress)
-    return _warn_of_invalid_numbers(finish_result(reducer, recorded, network, smoothing), network)
+    return _return_with_warnings(finish_result(reducer, recorded, network, smoothing), network)
 
 
 def _has_long_step(network: "Network") -> bool:
     """Return whether a fusion between neighbours has too many operations a step to be written out as native code."""
-    return any(mesh.is_long for mesh in build_meshes(network).values())
+    return any(mesh.has_long_step for mesh in build_meshes(network).values())
 
 
-def _warn_of_invalid_numbers(result: Result, network: Network) -> Result:
+def _return_with_warnings(result: Result, network: Network) -> Result:
     """Return the result as it is; warn where a record holds what is no number, or a state beyond its limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
-        warn_of_no_numbers(result, complete, stacklevel=4)
+        warn_of_non_finite_numbers(result, complete, stacklevel=4)
     return result
 
 

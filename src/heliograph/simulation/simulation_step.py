@@ -7,22 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.estimate import Estimate
-from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memories_of_channels import condition_on_memories
+from heliograph.random_affine.memory import condition_on_memories
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
-from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.transmission.reception import AbstractMedium
-from heliograph.simulation.transmission.shared_fading import (
+from heliograph.simulation.transmission.channel_draws import (
     PLANT,
     move_modes,
-    number_memories,
+    number_memory_seeds,
     start_modes,
 )
+from heliograph.simulation.transmission.reception import AbstractMedium
 from straightline import present
 
 
@@ -51,7 +51,7 @@ class World(Module):
     @property
     def _memory_numbers(self) -> np.ndarray:
         """Numbers that seed the draws of the plant's memories (memories,)."""
-        return number_memories({PLANT: self.plant}, self.plant)[PLANT]
+        return number_memory_seeds({PLANT: self.plant}, self.plant)[PLANT]
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step the world over step k: return its next state, and what is recorded of the step.
@@ -63,16 +63,16 @@ class World(Module):
 
         Returns:
             The next state, and "truth" (n,), "measurements" (node, received) by group, "transmissions" by group, and
-            all that `AllFilters.step` puts out.
+            all that `AllFilters.step` puts out, with estimated angles within half a turn of the true ones.
         """
         (x, medium, states, edges, modes), (k, u) = carry, row
         # The plant moves, in the present modes of its memories, and its nodes receive.
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
-        # Where nothing is ever missing, native code is told so.
+        # Measurements of which nothing is ever missing are marked, so that native code need not look for NaN.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
-        # What reports and messages between neighbours do; then all filters.
+        # Draw which reports and messages between neighbours arrive; then step all filters.
         drawn: dict[str, PyTree] = {
             name: by_report.uplinks.draw(key, k) for name, by_report in self.filters.reporting.items()
         }
@@ -86,12 +86,12 @@ class World(Module):
             "truth": x,
             "measurements": z,
             "transmissions": self.medium.reasons(medium),
-            **_turn_to_truth(plant, x, outputs),
+            **_turn_angles_to_truth(plant, x, outputs),
         }
         return after, results
 
 
-def _turn_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
+def _turn_angles_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str, PyTree]) -> dict[str, PyTree]:
     """Return the estimates with angles within half a turn of the truth, so that x - xhat is the error."""
     if not plant.circular:
         return outputs

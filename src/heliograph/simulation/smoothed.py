@@ -22,6 +22,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
 from heliograph.simulation.network import FUSED, Claims, Network
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import (
     AbstractReducer,
@@ -31,7 +32,6 @@ from heliograph.simulation.results.reducer import (
     reduce_rows,
     trajectories_record,
 )
-from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.fixed_interval_lag_point import AbstractSmoothing, nis_sums, warn_if_inconsistent
 
 
@@ -78,7 +78,7 @@ class NetworkSmoother(Module):
             truth = self.smoothing.select_reference(outputs["truth"])
             smoothed |= {
                 "truth": truth,
-                **_turn_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
+                **_turn_angles_to_truth(truth, smoothed, [steps.angles for steps in steps_by_kind]),
             }
         # Sums of the NIS, for the test of consistency.
         sum_nis = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
@@ -87,7 +87,7 @@ class NetworkSmoother(Module):
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
 
-def _turn_to_truth(
+def _turn_angles_to_truth(
     truth: jax.Array, smoothed: Mapping[str, PyTree], angles_of_kinds: Sequence[Angles]
 ) -> dict[str, PyTree]:
     """Return the estimates with their angles within half a turn of the truth, so that x - xhat is the error.

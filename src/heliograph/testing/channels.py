@@ -11,7 +11,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.monomials import evaluate_monomials, list_exponents
-from heliograph.simulation.runs.over_runs import over_runs
+from heliograph.simulation.runs.map_over_runs import over_runs
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
 

@@ -26,8 +26,8 @@ from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.modes.uncertain_chain import UncertainModalFilter
 from heliograph.filters.wrappers.fed_back import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
-from heliograph.model.over_time import OverTime, at_each_step, first, stacked
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, OfInputs, Plant
+from heliograph.model.over_time import OverTime, at_each_step, first, stack_over_time
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, Plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
@@ -202,11 +202,11 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 
 
 def _rescale_matrix(
-    matrix: OfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
+    matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
     """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
     factor = out[:, None] / into
-    if isinstance(matrix, OfInputs):
+    if isinstance(matrix, MatrixOfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
     return np.asarray(out[:, None] * matrix / into)
 
@@ -260,7 +260,7 @@ def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.nd
 
 def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of a channel z = G y + n by mode in other units: z = Q G R^-1 y + Q n in each."""
-    values: Modes = stacked(channel)
+    values: Modes = stack_over_time(channel)
     of_mean, of_spread = _scale_channel(units)
     noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread
@@ -270,7 +270,7 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
 
 def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
     """Return the combinations of a filter's atoms with state and measurements in other units."""
-    values = stacked(components)
+    values = stack_over_time(components)
     q = units.received
     scaled = AtomCombinations(
         values.weight,

@@ -11,18 +11,18 @@ import pytest
 import heliograph as hg
 from heliograph.numerics import seed_key
 from heliograph.relays.design import local_error_design
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Trajectories
 from heliograph.simulation.runs.native import compile_runs
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from straightline.nodes import Node, Unsupported
 from tests.relays.relay_problems import example
 from tests.simulation.both import Both
+from tests.simulation.test_channel_draws import PLANT as ALONE
+from tests.simulation.test_channel_draws import SENSOR as GAIN
+from tests.simulation.test_channel_draws import in_turn, link
 from tests.simulation.test_relay_worlds import relays
-from tests.simulation.test_shared_fading import PLANT as ALONE
-from tests.simulation.test_shared_fading import SENSOR as GAIN
-from tests.simulation.test_shared_fading import in_turn, link
 from tests.simulation.test_simulate import INPUTS, NETWORK
 
 # Near its least value a trace changes with the square of the weight, which is known to the root of rounding over that

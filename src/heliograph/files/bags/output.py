@@ -12,7 +12,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.disk.whole_file import check_writable, whole_file
-from heliograph.model.estimate import Claim, is_sound
+from heliograph.model.estimate import Claim, mask_sound_estimates
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float
@@ -189,7 +189,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
             mean=np.asarray(estimate.mean),
             covariance=np.asarray(estimate.covariance),
             claims=np.asarray(estimate.claims),
-            sound=is_sound(estimate),
+            sound=mask_sound_estimates(estimate),
         )
         for node, filters in record.estimates.items()
         for name, estimate in filters.items()

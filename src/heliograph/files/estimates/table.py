@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heliograph.files.table import TIME, write_table
-from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.estimate import Estimate, mask_sound_estimates
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.rotation_vectors import quaternion_of
 from heliograph.numerics.types import units_in
@@ -97,7 +97,7 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
     # Probabilities of the modes of a Markov chain, (rows, modes).
     if estimate.modes is not None:
         columns += [(f"mode.{m}", values) for m, values in enumerate(np.asarray(estimate.modes).T)]
-    return [*columns, ("valid", is_sound(estimate))]
+    return [*columns, ("valid", mask_sound_estimates(estimate))]
 
 
 def _make_predicted_columns(

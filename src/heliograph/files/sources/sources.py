@@ -21,7 +21,7 @@ from heliograph.files.sources.json_field import Field, Source
 from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.sources.several_senders import SenderCounter
 from heliograph.live.event import INPUTS
-from heliograph.model.checks.refusals import RefusedError
+from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.simulation.network import Network

@@ -12,11 +12,11 @@ from heliograph.filters.event.stochastic_event_filter import StochasticEventFilt
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, lower_by_noise
+from heliograph.model.estimate import Claim, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import OverTime, first, restack, unstack
-from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.over_time import OverTime, first, unstack, vary_over_steps
+from heliograph.model.plant import AnyPlant, read_first_plant
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
 from heliograph.model.trigger import AbstractThreshold, AbstractTrigger, Periodic, StochasticTrigger
 from heliograph.numerics.check import check_count, fail, instance
@@ -65,7 +65,7 @@ def event_filter(
     Source: the sum over the sender's reference; Sijs and Lazar, Event based state estimation with time synchronous
         updates (2012), for what silence says; Han et al. (2015) for the stochastic trigger.
     """
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     instance("trigger", trigger, AbstractTrigger, "a trigger, such as SendOnDelta(0.5)")
     check_link(first(sensor), first(channel), len(start.states))
     refuse_angles("event filter", plant, sensor)
@@ -86,7 +86,7 @@ def event_filter(
     premise = Premise(plant, sensor, channel, trigger, order=None)
     if isinstance(trigger, StochasticTrigger | Periodic):
         claim = _decide_claim(plant, sensor, channel, trigger)
-        return on_premise(
+        return with_premise(
             StochasticEventFilter(trigger=trigger, **fields_of_both, **make_sizes(claim, start, received)), premise
         )
     # A threshold: a sum of Gaussians, by the value with which the sender compares. Ages of that value are counted up to
@@ -101,7 +101,7 @@ def event_filter(
         **fields_of_both,
         **make_sizes("nominal", start, received),
     )
-    return on_premise(filter, premise)
+    return with_premise(filter, premise)
 
 
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
@@ -111,7 +111,7 @@ def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
     parts = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
-    return restack(parts, channel), np.asarray(steps[0].initial)
+    return vary_over_steps(parts, channel), np.asarray(steps[0].initial)
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
@@ -123,7 +123,7 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
     if not is_linear(plant, sensor) or uncertain_chain(channel) or not all(_has_known_gain(step) for step in steps):
         return "nominal"
     if isinstance(trigger, Periodic):
-        return lower_by_noise("exact", plant, sensor, channel)
+        return lower_claim_by_noise("exact", plant, sensor, channel)
     # Silence keeps a Gaussian one, where it is no hidden loss; that a value was sent must say nothing more than it.
     losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
     determined = all(_arrival_determines_y(step) for step in steps)

@@ -32,7 +32,7 @@ from heliograph.filters.received_outlier_noise import NoiseBranches, ReceivedNoi
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import OverTime, at, at_each_step
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.angle import wrap_near
 from heliograph.numerics.check import TINY, fail, scalar
@@ -282,7 +282,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
         received=filter.received,
     )  # fmt: skip
-    return on_premise(adaptive, filter.premise)
+    return with_premise(adaptive, filter.premise)
 
 
 def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:

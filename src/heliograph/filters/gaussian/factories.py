@@ -10,11 +10,11 @@ from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
-from heliograph.model.estimate import lower_by_noise
+from heliograph.model.estimate import lower_claim_by_noise
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import first, unstack
-from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.plant import AnyPlant, read_first_plant
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import SEVERAL_TAKEN_BY, AnySensor, is_linear
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import ArrayLike, Float
@@ -46,7 +46,7 @@ def _make_gaussian_filter(
         initial_covariance: its covariance (n, n); None for the plant's.
         trusted: whether the channel is the true one, so that more than "nominal" may be claimed.
     """
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
@@ -62,7 +62,7 @@ def _make_gaussian_filter(
     without_angles = not start.circular and not first(sensor).circular
     linear = without_angles and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim = update.claim(uncertain=False) if linear and trusted and not prior_given else "nominal"
-    claim = lower_by_noise(claim, plant, sensor, channel)
+    claim = lower_claim_by_noise(claim, plant, sensor, channel)
     filter = GaussianFilter(
         plant=plant,
         sensor=sensor,
@@ -75,7 +75,7 @@ def _make_gaussian_filter(
         observed_angles=angles,
         **make_sizes(claim, start, first(channel).outputs),
     )
-    return on_premise(filter, premise)
+    return with_premise(filter, premise)
 
 
 @accept_limits

@@ -29,12 +29,12 @@ from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cub
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
 from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
-from heliograph.model.modes_of_motion import ModalPlant
+from heliograph.model.diffuse_start import UnknownStart
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
+from heliograph.model.markov_jump_models import ModalPlant
 from heliograph.model.over_time import at, first
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, read_first_plant
 from heliograph.model.premises.premise import believes
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
@@ -144,10 +144,10 @@ def transform_about_mean(
     """
     # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
-    image = transform.image(plant.moves(u, x.mean, middle), x)
+    image = transform.image(plant.make_motion_about(u, x.mean, middle), x)
     for _ in range(MEAN_STEPS if plant.attitude and not transform.keeps_center else 0):
         middle = plant.manifold.settle(middle, image.mean)
-        image = transform.image(plant.moves(u, x.mean, middle), x)
+        image = transform.image(plant.make_motion_about(u, x.mean, middle), x)
     return middle, image
 
 
@@ -219,10 +219,10 @@ def open_loop_filter(
 
     Source: the prediction step of any of the filters, alone.
     """
-    start = check_plant(plant)
-    mean, spread, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
+    start = read_first_plant(plant)
+    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
-    claim = lower_by_noise("exact" if linear else "nominal", plant)
+    claim = lower_claim_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

@@ -16,7 +16,7 @@ from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at, first, unstack
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.compensated_arithmetic import Compensated, compensate, split_sum
@@ -194,7 +194,7 @@ def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFi
         known_gain=all(not np.any(c.gain_spread) and not c.uncertain for c in unstack(base.channel)),
         **make_sizes(base.claim, base, base.received),
     )
-    return on_premise(centred, base.premise)
+    return with_premise(centred, base.premise)
 
 
 def _start_at_zero(base: Any) -> Any:

@@ -13,7 +13,7 @@ from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, instance
@@ -71,7 +71,7 @@ def robust_filter(
         Bayes (2024), for weights of one update.
     """
     # Parts that fit, and the rule's type.
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     check_link(first(sensor), first(channel), len(start.states), moments=False)
     if rule is not None:
         instance("rule", rule, AbstractWeightingRule, "one such as Huber(1.345), or None for the score update")

@@ -25,7 +25,7 @@ from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import have_same_structure, stack
 from heliograph.model.premises.agreement import join_premises
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -133,4 +133,4 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     central = SequentialFilter(filters=nodes, **make_sizes(claim, nodes[0], sum(filter.received for filter in nodes)))
     # What the claim is about is known if it is of every node.
     premises = [filter.premise for filter in nodes if filter.premise is not None]
-    return on_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)
+    return with_premise(central, join_premises(premises) if len(premises) == len(nodes) else None)

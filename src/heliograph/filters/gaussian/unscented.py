@@ -11,7 +11,7 @@ from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import TINY, fail, scalar
 from heliograph.numerics.numpy_or_jax import is_traced
@@ -131,6 +131,6 @@ def unscented_filter(
     Source: Wan and van der Merwe, The unscented Kalman filter (2001).
     """
     transform = Unscented(scalar("alpha", alpha), scalar("beta", beta), scalar("kappa", kappa))
-    check_plant(plant)
+    read_first_plant(plant)
     transform.check(len(first(plant).states))
     return gaussian_filter(plant, sensor, channel, transform, update, initial_mean, initial_covariance)

@@ -27,12 +27,12 @@ from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
-from heliograph.model.modes_of_motion import models_of
-from heliograph.model.over_time import OverTime, at, first, stacked
+from heliograph.model.markov_jump_models import list_mode_models
+from heliograph.model.over_time import OverTime, at, first, stack_over_time
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import believes, on_premise
+from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
@@ -113,8 +113,8 @@ class LinearFilter(AbstractSizedFilter):
     @property
     def has_known_gain(self) -> bool:
         """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
-        whole = stacked(self.channel)
-        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded_noises(self.sensor))
+        whole = stack_over_time(self.channel)
+        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
 
     def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
@@ -218,7 +218,7 @@ def linear_filter(
     # Delays: the same filter for the system enlarged by past signals.
     if check_maps("channel", [first(channel)])[0].past:
         return wrappers.build_behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
-    for moves, senses in product(models_of(first(plant)), models_of(first(sensor))):
+    for moves, senses in product(list_mode_models(first(plant)), list_mode_models(first(sensor))):
         check_linear("linear filter", moves, senses)
         check_link(senses, first(channel), len(moves.states))
     # Memory: the modes are estimated jointly with the state. A sensor that rounds may lower the claim.
@@ -228,11 +228,11 @@ def linear_filter(
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return replace(filter, claim=lower_by_noise(filter.claim, sensor)) if find_rounded_noises(sensor) else filter
+        return replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
-    whole = stacked(described)
+    whole = stack_over_time(described)
     start = first(plant)
     return LinearFilter(
         plant=plant,
@@ -241,7 +241,7 @@ def linear_filter(
         rule=rule,
         mean_known=not whole.uncertain or has_known_mean(whole),
         **make_sizes(
-            lower_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
+            lower_claim_by_noise(rule.claim(whole.uncertain), plant, sensor, channel),
             start,
             first(channel).outputs,
         ),
@@ -338,4 +338,4 @@ def as_current_filter(
 
 def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:
     """Return the same filter with claim nominal: it ignores delay or memory that the link has."""
-    return on_premise(replace(ignoring, claim="nominal"), ignoring.premise)
+    return with_premise(replace(ignoring, claim="nominal"), ignoring.premise)

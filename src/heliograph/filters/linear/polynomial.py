@@ -19,11 +19,11 @@ from heliograph.linear.plant_and_measurement_maps import check_model
 from heliograph.linear.polynomial_filter_errors import quadratic_system_with_linear_estimate
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
@@ -191,7 +191,7 @@ def polynomial_filter(
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
     filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
-    return on_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
+    return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
 def _lift_about_mean(
@@ -232,7 +232,9 @@ def scheduled_polynomial_filter(
     """
     centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
     inner = ScheduledFilter(lmmse(system, polynomial_claim(plant, sensor, channel, degree)), first(plant).states)
-    return on_premise(PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree))
+    return with_premise(
+        PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree)
+    )
 
 
 class MemoryState(NamedTuple):
@@ -315,7 +317,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
     filter = MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim, centre)
-    return on_premise(filter, Premise(plant, sensor, channel, order=4))
+    return with_premise(filter, Premise(plant, sensor, channel, order=4))
 
 
 def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int) -> Claim:
@@ -330,4 +332,4 @@ def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degre
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
         claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
-    return lower_by_noise(claim, plant, sensor, channel)
+    return lower_claim_by_noise(claim, plant, sensor, channel)

@@ -45,7 +45,7 @@ from heliograph.filters.modes.linear_by_mode import centred_measurement, centred
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Innovation
-from heliograph.model.over_time import OverTime, at, first, restack, unstack
+from heliograph.model.over_time import OverTime, at, first, unstack, vary_over_steps
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
@@ -268,4 +268,4 @@ def independent_terms(channel: Channel) -> list[Channel]:
     steps = [split_terms_without_common_memory(step) for step in unstack(channel)]
     if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
         return [channel]
-    return [restack(parts, channel) for parts in zip(*steps, strict=True)]
+    return [vary_over_steps(parts, channel) for parts in zip(*steps, strict=True)]

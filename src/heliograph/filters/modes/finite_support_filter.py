@@ -38,7 +38,7 @@ from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, list_steps, restack, steps_covered
+from heliograph.model.over_time import OverTime, at, first, list_models_by_step, steps_covered, vary_over_steps
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -231,15 +231,15 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     # All combinations of atoms, mode by mode, for each step where they vary; one step stands for all where none do.
     added_variance = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2
     steps = steps_covered((sensor, channel)) or 1
-    modes = [_joint_modes_of(now) for now in list_steps(channel, steps)]
+    modes = [_joint_modes_of(now) for now in list_models_by_step(channel, steps)]
     modes_before = [modes[0], *modes[:-1]]
     combinations = [
         _list_combinations(of_step, now, before, added_variance)
-        for of_step, now, before in zip(list_steps(sensor, steps), modes, modes_before, strict=True)
+        for of_step, now, before in zip(list_models_by_step(sensor, steps), modes, modes_before, strict=True)
     ]
     return MixtureFilter(
         plant=plant,
-        components=restack(combinations, sensor, channel),
+        components=vary_over_steps(combinations, sensor, channel),
         initial=modes[0].initial,
         observed_angles=find_received_angles(plant, sensor, channel),
         **make_sizes("nominal", first(plant), first(channel).outputs),

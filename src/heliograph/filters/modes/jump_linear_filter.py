@@ -44,9 +44,9 @@ from heliograph.filters.modes.models_by_mode import find_models
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
-from heliograph.model.modes_of_motion import models_of
-from heliograph.model.over_time import OverTime, at, first, restack, unstack
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
+from heliograph.model.markov_jump_models import list_mode_models
+from heliograph.model.over_time import OverTime, at, first, unstack, vary_over_steps
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
@@ -216,7 +216,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
         """Return the laws of motion of a step."""
-        return models_of(at(self.plant, k))
+        return list_mode_models(at(self.plant, k))
 
     def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
         """Return how the state moves about its centre in each mode of the step."""
@@ -225,7 +225,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
-        channel, sensors, law = at(self.channel, k), models_of(at(self.sensor, k)), state.law
+        channel, sensors, law = at(self.channel, k), list_mode_models(at(self.sensor, k)), state.law
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
         matrix, common = subtract_mean_output(gains @ measure, law)
@@ -350,7 +350,7 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
     models = first(plant), first(sensor)
     # The plant's and the sensor's model in each joint mode.
     by_mode = joint_modes(first(channel), beside=models).beside
-    claim = lower_by_noise(claim_of_modes(channel), *models_of(models[0]), *models_of(models[1]))
+    claim = lower_claim_by_noise(claim_of_modes(channel), *list_mode_models(models[0]), *list_mode_models(models[1]))
     return ModalFilter(
         plant=drop_names(plant),
         sensor=drop_names(sensor),
@@ -373,7 +373,7 @@ def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array
     """
     steps = [joint_modes(c, beside=beside) for c in unstack(channel)]
     models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    return steps[0].initial, restack(models, channel)
+    return steps[0].initial, vary_over_steps(models, channel)
 
 
 def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:

@@ -9,8 +9,8 @@ from heliograph.filters.base import make_sizes
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
 from heliograph.model.channel import Channel, check_link, find_received_angles
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, models_of
-from heliograph.model.over_time import OverTime, first, restack, unstack
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, list_mode_models
+from heliograph.model.over_time import OverTime, first, unstack, vary_over_steps
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, instance
@@ -29,7 +29,7 @@ def describe_joint_modes(
         for step in parts:
             _check_density(step)
     # The chain is the same at each step; what it does to the signal may differ.
-    return steps[0], restack(parts, channel)
+    return steps[0], vary_over_steps(parts, channel)
 
 
 def _check_density(channel: ChannelByPattern) -> None:
@@ -56,7 +56,7 @@ def fields_of_mode_filters(
 ) -> dict[str, Any]:
     """Return the fields that all filters of modes share; a gain that drifts has `nodes` modes."""
     start = instance("plant", first(plant), AbstractPlant, "a plant")
-    for model in models_of(first(sensor)):
+    for model in list_mode_models(first(sensor)):
         check_link(model, first(channel), len(start.states))
     angles = find_received_angles(plant, sensor, channel)
     joint, described = describe_joint_modes(first(plant), first(sensor), channel, nodes)

@@ -59,7 +59,7 @@ from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.filters.wrappers.told_link_law import accept_told_numbers
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import ModalPlant, models_of, transition_over
+from heliograph.model.markov_jump_models import ModalPlant, list_mode_models, transition_over
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
@@ -187,7 +187,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
         """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
-        plants, u, modes = models_of(at(self.plant, k)), jnp.asarray(u), len(self.initial)
+        plants, u, modes = list_mode_models(at(self.plant, k)), jnp.asarray(u), len(self.initial)
         mixing, weight = self.merging.mixing_weights(state.weight, self.transition_matrix(state, u, k))
         parts = mix_and_predict_by_mode(
             plants=plants,
@@ -212,7 +212,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Correct each component in each mode with z, and weight them by their likelihood."""
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
         _, j = self.merging.list_update_pairs(modes)
-        (signal, weights), plant = self.prior_signals(state, k), models_of(at(self.plant, k))[0]
+        (signal, weights), plant = self.prior_signals(state, k), list_mode_models(at(self.plant, k))[0]
         after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
         parts = after._replace(mean=align_angles(plant, after.mean, weight))
         return ModalBeliefs(*self.merging.keep_components(parts, weight, modes), state.moved), mixed
@@ -224,7 +224,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def signals_of_pairs(self, parts: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
         """Return the signal of each pair (component, mode): of the mode's sensor under the component's prior."""
-        plant, sensors = models_of(at(self.plant, k))[0], models_of(at(self.sensor, k))
+        plant, sensors = list_mode_models(at(self.plant, k))[0], list_mode_models(at(self.sensor, k))
         (component, mode), start = pairs, second_moments_at_start(self.plant)
         sensor_of_pair, results = np.array(self.sensor_modes)[mode], list[Signal]()
         # Sensor after sensor: of each component once, then one for each of the sensor's pairs.
@@ -253,7 +253,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
-        plants, modes = models_of(at(self.plant, step.k)), len(self.initial)
+        plants, modes = list_mode_models(at(self.plant, step.k)), len(self.initial)
         law = self._find_law_by_mode(step.after)
         described = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
@@ -274,7 +274,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> _PairSmootherTerms:
         """Return what a smoother by pairs of modes needs of a step; `after`: the law by mode after its correction."""
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
-        plants, start = models_of(at(self.plant, k)), second_moments_at_start(self.plant)
+        plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)
         moved = move_pairs(
             plants, np.array(self.plant_modes), self.transform, before.gaussian, jnp.asarray(step.u), start
         )

@@ -41,7 +41,7 @@ from heliograph.filters.particles.state_particles import MANY, StateParticleFilt
 from heliograph.filters.wrappers.state_limits import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes

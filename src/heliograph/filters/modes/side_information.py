@@ -36,11 +36,11 @@ from heliograph.filters.modes.jump_linear_filter import (
 )
 from heliograph.filters.modes.linear_by_mode import centred_measurement, centred_transition, noise_in_mode
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Estimate, Innovation, lower_by_noise
+from heliograph.model.estimate import Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import uncertain_chain, with_flag
-from heliograph.model.over_time import OverTime, at, at_each_step, first, restack, unstack
+from heliograph.model.over_time import OverTime, at, at_each_step, first, unstack, vary_over_steps
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.check import array, probabilities
@@ -367,11 +367,11 @@ def side_information_filter(
         for i, row in enumerate(chances):
             probabilities(f"flags in mode {i}", row)
         steps = [replace(step, flags=chances) for step in steps]
-    claim = lower_by_noise("exact" if is_known else "nominal", plant, sensor, channel)
+    claim = lower_claim_by_noise("exact" if is_known else "nominal", plant, sensor, channel)
     filter = SideInformationFilter(
         plant=plant,
         sensor=sensor,
-        channel=restack(steps, channel),
+        channel=vary_over_steps(steps, channel),
         initial=initial,
         flagged=flags is not None,
         **make_sizes(claim, first(plant), first(channel).outputs + (flags is not None)),
@@ -381,7 +381,7 @@ def side_information_filter(
     if flags is not None and len(memories(channel)) != 1:
         return filter
     received = channel if flags is None else at_each_step(lambda link: with_flag(link, chances), channel)
-    return on_premise(filter, Premise(plant, sensor, received))
+    return with_premise(filter, Premise(plant, sensor, received))
 
 
 @cache_by_object

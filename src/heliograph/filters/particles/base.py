@@ -15,7 +15,7 @@ from heliograph.filters.particles.native_particle_loop import filter_particles
 from heliograph.filters.particles.received_density import ReceivedDensity
 from heliograph.filters.particles.resampling import effective_number, resample_systematically
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
@@ -67,7 +67,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of its plant, and those that its channel delivers."""
-        return FilterAngles(models_of(first(self.plant))[0].angles, self.observed_angles)
+        return FilterAngles(list_mode_models(first(self.plant))[0].angles, self.observed_angles)
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
         """Filter rows with a lane for each particle where these are enough."""

@@ -10,8 +10,8 @@ from heliograph.filters.particles.affine_check import is_affine
 from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.received_density import find_received_density
 from heliograph.model.channel import Channel, check_link, find_received_angles
-from heliograph.model.modes_of_motion import models_of
-from heliograph.model.over_time import first, list_steps, restack, steps_covered, unstack
+from heliograph.model.markov_jump_models import list_mode_models
+from heliograph.model.over_time import first, list_models_by_step, steps_covered, unstack, vary_over_steps
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance, items, scalar
@@ -44,8 +44,8 @@ def build_partly_drawn(
         drawn: names of the drawn states; None for all.
         nodes: number of modes that stand for a gain that drifts.
     """
-    start = models_of(instance("plant", first(plant), AbstractPlant, "a plant"))[0]
-    for model in models_of(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
+    start = list_mode_models(instance("plant", first(plant), AbstractPlant, "a plant"))[0]
+    for model in list_mode_models(instance("sensor", first(sensor), AbstractSensor, "a sensor")):
         model.refuse_inputs("particle_filter")
         check_link(model, first(channel), len(start.states), moments=False)
     drawn_places = _find_places_of_drawn(start, drawn)
@@ -57,13 +57,15 @@ def build_partly_drawn(
     # varies.
     steps = steps_covered((sensor, channel)) or 1
     densities = []
-    for sensor_of_step, link in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True):
+    for sensor_of_step, link in zip(
+        list_models_by_step(sensor, steps), list_models_by_step(channel, steps), strict=True
+    ):
         maps = joint_modes(link, nodes, beside=(first(plant), first(sensor))).maps
-        densities.append(find_received_density([models_of(sensor_of_step)[i] for i in sensor_modes], maps))
+        densities.append(find_received_density([list_mode_models(sensor_of_step)[i] for i in sensor_modes], maps))
     return PartlyDrawnFilter(
         plant=drop_names(plant),
         sensor=drop_names(sensor),
-        density=restack(densities, sensor, channel),
+        density=vary_over_steps(densities, sensor, channel),
         initial=joint.initial,
         transition=joint.transition,
         resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
@@ -91,7 +93,7 @@ def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> 
 
 def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:
     """Raise ValueError unless, given the drawn states, the rest is Gaussian and moves and is measured linearly."""
-    for model in [model for step in unstack(plant) for model in models_of(step)]:
+    for model in [model for step in unstack(plant) for model in list_mode_models(step)]:
         rest = [i for i in range(len(model.states)) if i not in drawn]
         names = [model.states[i] for i in rest]
         if isinstance(model.noise, AbstractNoise) and not isinstance(model.noise, Gaussian):
@@ -105,7 +107,7 @@ def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ..
         if not isinstance(model, LinearPlant) and not is_affine(model.transition, model.initial_mean, rest, u):
             expected = f"states given which the plant is linear in {names}, as its operations show (draw more)"
             raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")
-        for sensing in [model for step in unstack(sensor) for model in models_of(step)]:
+        for sensing in [model for step in unstack(sensor) for model in list_mode_models(step)]:
             if not isinstance(sensing, LinearSensor) and not is_affine(sensing.measure, model.initial_mean, rest):
                 expected = f"states given which the sensor is linear in {names}, as its operations show (draw more)"
                 raise fail("drawn", expected, f"{[model.states[i] for i in drawn]}")

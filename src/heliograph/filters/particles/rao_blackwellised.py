@@ -49,7 +49,7 @@ from heliograph.filters.particles.proposal import PRIOR_SHARE, factor_noise_cova
 from heliograph.filters.particles.received_density import ReceivedAtoms
 from heliograph.filters.particles.resampling import draw_normals, draw_uniforms, fold_in_bits
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.modes_of_motion import models_of
+from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
@@ -115,10 +115,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
         """Return the law of x_0 for the particles of these numbers (B,)."""
-        start, count, order = models_of(at(self.plant, 0))[0], len(numbers), np.array(self.order)
+        start, count, order = list_mode_models(at(self.plant, 0))[0], len(numbers), np.array(self.order)
         x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
-        if not self._is_linear(models_of(at(self.plant, 0))):
+        if not self._is_linear(list_mode_models(at(self.plant, 0))):
             x = self._draw_states(x, key, numbers)
         log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (count, 1))
         return Cloud(repeat_for_modes(x, len(self.initial)), log_mode)
@@ -141,7 +141,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         self, particles: Cloud, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[Cloud, None]:
         """Move the Gaussians of particles (B,) by the law of every mode that may follow."""
-        plants, (gaussian, log_mode) = models_of(at(self.plant, k)), particles
+        plants, (gaussian, log_mode) = list_mode_models(at(self.plant, k)), particles
         # What no measurement has drawn is drawn now; at the first step of a linear plant the start stays a Gaussian.
         mode = draw_index(log_mode, draw_uniforms(key[1], numbers, 1, self.particles)[:, 0])
         in_mode: Gaussian = jax.tree.map(lambda leaf: leaf[jnp.arange(len(mode)), mode], gaussian)
@@ -207,7 +207,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         self, particles: Cloud, law: None, numbers: jax.Array | None, key: jax.Array, z: jax.Array, k: Step
     ) -> WeighedParticles:
         """Draw mode and drawn states of particles (B,) with z, and weigh them by p(z) p / q."""
-        sensors, (gaussian, log_mode) = models_of(at(self.sensor, k)), particles
+        sensors, (gaussian, log_mode) = list_mode_models(at(self.sensor, k)), particles
         atoms, chance = at(self.density, k).given_arrivals(z)
         received = self._find_atoms_by_mode(z, atoms)
         # That nothing or only a part arrived says something of the mode.
@@ -216,7 +216,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         uniform = draw_uniforms(key[1], numbers, 3, self.particles)
         draw_and_weigh = jax.vmap(partial(self._draw_and_weigh, sensors, received))
         x, mode, log_ratio = draw_and_weigh(gaussian, log_mode, draws, uniform)
-        plant, modes = models_of(at(self.plant, k))[0], len(self.initial)
+        plant, modes = list_mode_models(at(self.plant, k))[0], len(self.initial)
         x = x._replace(mean=wrap_angles(x.mean, self._angles_in_order(plant)))
         certain = jnp.where(jnp.arange(modes) == mode[:, None], 0.0, -jnp.inf)
         predicted = jax.vmap(partial(self._expect_received, sensors, received))(gaussian, log_mode)
@@ -380,17 +380,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""
-        return sum_clouds_for_mean(weight, particles, self._angles_in_order(models_of(first(self.plant))[0]))
+        return sum_clouds(weight, particles, self._angles_in_order(list_mode_models(first(self.plant))[0]))
 
     def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
-        angles = self._angles_in_order(models_of(first(self.plant))[0])
-        return sum_clouds_for_covariance(weight, particles, sums, angles)
+        return sum_clouds_apart(weight, particles, sums, self._angles_in_order(list_mode_models(first(self.plant))[0]))
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
         back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
-        mean = sums.first.mean(self._angles_in_order(models_of(first(self.plant))[0]))
+        mean = sums.first.mean(self._angles_in_order(list_mode_models(first(self.plant))[0]))
         modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
         return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)
 

@@ -22,7 +22,7 @@ from heliograph.filters.particles.received_density import ReceivedAtoms, find_re
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.over_time import at, first, list_steps, restack, steps_covered, unstack
+from heliograph.model.over_time import at, first, list_models_by_step, steps_covered, unstack, vary_over_steps
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import wrap_angles
@@ -260,12 +260,14 @@ def build_state_particles(
     steps = steps_covered((sensor, channel)) or 1
     densities = [
         find_received_density([sensor_of_step], [channel_of_step])  # one mode
-        for sensor_of_step, channel_of_step in zip(list_steps(sensor, steps), list_steps(channel, steps), strict=True)
+        for sensor_of_step, channel_of_step in zip(
+            list_models_by_step(sensor, steps), list_models_by_step(channel, steps), strict=True
+        )
     ]
     return StateParticleFilter(
         plant=plant,
         sensor=sensor,
-        density=restack(densities, sensor, channel),
+        density=vary_over_steps(densities, sensor, channel),
         resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         particles=check_count("particles", particles),

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.words.word_channel import refuse_link
+from heliograph.model.words.word_channel import make_word_link_error
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Float
@@ -159,7 +159,7 @@ def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
             return _multiply_likelihoods([infer_sent_bits(part, piece) for part, piece in pieces], ())
         case Erasure():  # what is lost has likelihoods 1 already
             return infer_sent_bits(link.base, received)
-    raise refuse_link(type(link).__name__)
+    raise make_word_link_error(type(link).__name__)
 
 
 def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:

@@ -15,11 +15,11 @@ from heliograph.filters.wrappers.delay import late_filter
 from heliograph.model.channel import Channel, check_link, perfect
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import at_each_step, first, unstack
-from heliograph.model.plant import AnyPlant, check_plant
-from heliograph.model.premises.premise import Premise, on_premise
+from heliograph.model.plant import AnyPlant, read_first_plant
+from heliograph.model.premises.premise import Premise, with_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor, check_sensor, refuse_angles
 from heliograph.model.words.encoder import Dither, Words
-from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
+from heliograph.model.words.word_channel import FLAG, find_carried_components, rewrite_about_centres
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.delay import DelayedLink
@@ -115,7 +115,7 @@ def word_filter(
     """
     if not isinstance(hypotheses, int) or hypotheses not in (1, 2):
         raise fail("hypotheses", "1 or 2", show_value(hypotheses))
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     check_sensor(first(sensor), len(start.states))
     # Behind a constant delay: the filter of the past, predicted to the present.
     if isinstance(channel, DelayedLink) and channel.constant and not channel.timestamped:
@@ -125,8 +125,8 @@ def word_filter(
     refuse_angles("word filter", plant, sensor)
     # The words, the component of y (or flag) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
-    places = find_places(channel)
-    links = at_each_step(make_link_of_bits, channel)
+    places = find_carried_components(channel)
+    links = at_each_step(describe_link, channel)
     no_flips = all(is_free_of_flips(link) for link in unstack(links))
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
@@ -150,5 +150,5 @@ def word_filter(
         certain=no_flips,
         **make_sizes("nominal", start, len(places) + dithers),
     )
-    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else make_two_hypotheses_filter(one_gaussian)
-    return on_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))
+    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else keep_two_hypotheses(one_gaussian)
+    return with_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

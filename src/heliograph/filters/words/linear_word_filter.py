@@ -18,12 +18,12 @@ from heliograph.filters.words.bit_likelihoods import list_told_modes
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
-from heliograph.model.estimate import Claim, Innovation, lower_by_noise, weakest
+from heliograph.model.estimate import Claim, Innovation, lower_claim_by_noise, weakest
 from heliograph.model.over_time import at_each_step, first, unstack
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.model.words.encoder import Words
-from heliograph.model.words.word_channel import FLAG, find_places, rewrite_about_centres
+from heliograph.model.words.word_channel import FLAG, find_carried_components, rewrite_about_centres
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import has_random_gain, second_order
@@ -101,12 +101,12 @@ def build_behind_words(
         ValueError: words that do not fit, a dither that is not known behind a link that remembers, a range that is
             overloaded more often than once in a thousand steps.
     """
-    start = check_plant(plant)
+    start = read_first_plant(plant)
     check_linear("linear filter", plant, sensor)
     outputs = len(first(sensor).outputs)
     instance("encoder", encoder, Words, "Words").check_outputs(outputs)
     check_sent(first(sensor), first(channel))
-    places, numbers = find_places(channel), rewrite_about_centres(encoder, channel)
+    places, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
     # Laws of the words as numbers: of each mode where modes arrive with them, of each step else.
     told_modes = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
     laws = [first(law) for law in told_modes or unstack(numbers)]
@@ -126,7 +126,7 @@ def build_behind_words(
     gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"
-    claim = weakest([lower_by_noise(base.claim, rounded), claim_of_delay, _claim_despite_overload(overload)])
+    claim = weakest([lower_claim_by_noise(base.claim, rounded), claim_of_delay, _claim_of(overload)])
     return LinearWordsFilter(
         base=base,
         centres=centres,

@@ -25,7 +25,7 @@ from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at
-from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.plant import AnyPlant, read_first_plant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import wrap_near
@@ -216,7 +216,7 @@ def clock_filter(
 
     Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
     """
-    states = check_plant(plant).states
+    states = read_first_plant(plant).states
     names = [f"{name}_offset" for name in items("clocks", clocks, "names of nodes")]
     if not names or any(name not in states for name in names):
         raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))

@@ -25,13 +25,13 @@ from heliograph.filters.linear.linear_filter_state import LinearBelief, PlantMot
 from heliograph.filters.linear.precomputed_filter import PlannedFilter, plan_filter
 from heliograph.filters.modes.arrival_patterns import append_flag
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
+from heliograph.model.augmented.bias import append_driving_plant
+from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link, delayed
-from heliograph.model.enlarged.bias import append_driving_plant
-from heliograph.model.enlarged.past_outputs import with_past
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import at_each_step, first, stack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
-from heliograph.model.premises.premise import believes, on_premise
+from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
@@ -274,8 +274,10 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
-        return on_premise(late, premise)
-    return on_premise(late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel)))
+        return with_premise(late, premise)
+    return with_premise(
+        late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel))
+    )
 
 
 class KnownDelayFilter(AbstractWrapper):

@@ -16,9 +16,9 @@ from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Innovation, lower_by_noise
+from heliograph.model.estimate import Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters
-from heliograph.model.over_time import at, first, stacked
+from heliograph.model.over_time import at, first, stack_over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
@@ -176,7 +176,7 @@ def fed_back_filter(
     chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
     base = make_base_gaussian_filter("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
-    described = stacked(base.channel)
+    described = stack_over_time(base.channel)
     exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
-    claim = lower_by_noise("exact" if exact else "nominal", plant, sensor, channel)
+    claim = lower_claim_by_noise("exact" if exact else "nominal", plant, sensor, channel)
     return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

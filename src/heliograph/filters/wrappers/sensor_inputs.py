@@ -23,7 +23,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
@@ -145,4 +145,4 @@ def _build_filter_of_inputs(
         first(sensor).refuse_inputs(f"a {type(base).__name__}")
     filter = FilterOfInputs(base=base, plant=plant, sensor=sensor, **make_sizes(base.claim, base, base.received))
     premise = base.premise
-    return on_premise(filter, premise and premise.replaced(sensor=sensor))
+    return with_premise(filter, premise and premise.replaced(sensor=sensor))

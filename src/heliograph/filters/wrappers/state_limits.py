@@ -37,7 +37,7 @@ from heliograph.filters.wrappers.sensor_inputs import StateUnderInputs
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
@@ -244,4 +244,4 @@ def _make_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))
     premise = base.premise
-    return on_premise(limited, premise and premise.replaced(plant=plant))
+    return with_premise(limited, premise and premise.replaced(plant=plant))

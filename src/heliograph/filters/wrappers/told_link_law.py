@@ -23,11 +23,11 @@ from heliograph.filters.base import (
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.estimate import Innovation, weakest
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.premises.premise import on_premise
-from heliograph.model.reported_numbers import separate_told
+from heliograph.model.premises.premise import with_premise
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
@@ -200,13 +200,13 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
-    link = at_each_step(lambda channel: make_laws_certain(separate_told(channel).link), channel)
+    link = at_each_step(lambda channel: make_certain(separate_told_numbers(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
     if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):
         claim = weakest([claim, "nominal"])
     # Rows of z in which the link's values and the told numbers stand.
-    _, values, numbers = separate_told(first(channel))
+    _, values, numbers = separate_told_numbers(first(channel))
     filter = ToldFilter(
         base=base,
         plant=plant,
@@ -218,7 +218,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
         **make_sizes(claim, base, len(values) + len(numbers)),
     )
     premise = base.premise
-    return on_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
+    return with_premise(filter, premise and premise.replaced(sensor=sensor, channel=channel))
 
 
 @in_float64
@@ -241,16 +241,16 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
     parameters = inspect.signature(make)
 
     @wraps(make)
-    def build_with_told(*args: P.args, **kwargs: P.kwargs) -> F:
+    def build_with_told_numbers(*args: P.args, **kwargs: P.kwargs) -> F:
         """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
         # What is no channel reports nothing, and is for `make` to refuse.
         is_channel = isinstance(first(channel), AbstractRandomAffine)
-        reports_numbers = is_channel and len(separate_told(first(channel)).numbers) > 0
+        reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
         if not reports_numbers:
             return make(*args, **kwargs)
         plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
         return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
 
-    return build_with_told
+    return build_with_told_numbers

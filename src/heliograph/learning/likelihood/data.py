@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.row_times import check_dates, warn_of_unequal_steps
+from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.model.checks.row_times import read_row_dates, warn_of_unequal_steps
 from heliograph.numerics.check import array, check_columns, fail, show_value
 from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.times.data_row_checks import check_rows
@@ -122,7 +122,7 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
         warn_of_unequal_steps(network.inputs, clock)
     else:
         tables = {f"measurements of {name!r}": z for name, z in by_node.items()} | {"inputs": given_inputs}
-        check_dates(network.inputs, tables)
+        read_row_dates(network.inputs, tables)
     for name, z in by_node.items():
         check_columns(f"measurements of {name!r}", z, network.nodes[name].received_names)
     runs = _list_runs([np.asarray(fill_masked(by_node[name])) for name in network.names])

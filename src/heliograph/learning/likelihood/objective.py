@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.filter_for_likelihood import likelihood_filter
 from heliograph.learning.free_network import Build, Description
+from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.plant import AnyPlant

@@ -8,9 +8,9 @@ import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
-from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
-from heliograph.filters.filter_for_likelihood import likelihood_filter
-from heliograph.model.checks.row_times import check_dates
+from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
+from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.model.checks.row_times import read_row_dates
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_count, fail, instance
@@ -143,7 +143,7 @@ def predictive(
     # The channel given that something arrived: rows in which nothing did say nothing of the gains.
     received = channel.condition_on_arrival()
     filter = make_signal_filter(plant, sensor, received)
-    check_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
+    read_row_dates(filter.inputs, {"measurements": measurements, "inputs": inputs})
     z = check_rows("measurements", measurements, None, filter.received, missing=True)
     given_inputs = np.zeros((len(z), 0)) if inputs is None else inputs
     u = check_rows("inputs", given_inputs, len(z), len(filter.inputs), missing=False)

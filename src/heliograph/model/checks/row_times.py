@@ -44,10 +44,10 @@ def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> No
         clock: times of the rows, numbers or dates; None where they are not known.
     """
     if clock is not None and TIME_STEP not in inputs and (said := unequal_steps(clock)):
-        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_find_caller())
+        warnings.warn(f"time: {said}: {ONE_STEP}", stacklevel=_count_frames_up_to_user())
 
 
-def check_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
+def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarray | None:
     """Return the dates of the rows of tables; warn where their steps differ and the plant has no input dt to say so.
 
     Args:
@@ -62,7 +62,7 @@ def check_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.ndarr
     return clock
 
 
-def _find_caller() -> int:
+def _count_frames_up_to_user() -> int:
     """Return how many frames above the function that calls it the user's are: the first outside this package."""
     package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:

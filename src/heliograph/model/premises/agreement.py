@@ -9,18 +9,18 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
+from heliograph.model.augmented.joint_sensors import JointSensor, join_links
+from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel
-from heliograph.model.enlarged.joint_sensors import JointSensor, join_links
-from heliograph.model.enlarged.past_outputs import with_past
+from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.fading import memory_matters, without_memory
-from heliograph.model.modes_of_motion import ModalPlant, ModalSensor
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
 from heliograph.model.over_time import at, at_each_step, first, steps_covered, unstack
-from heliograph.model.plant import AbstractPlant, LinearPlant, OfInputs
+from heliograph.model.plant import AbstractPlant, LinearPlant, MatrixOfInputs
 from heliograph.model.premises.premise import MEAN_AND_COVARIANCE, Premise
 from heliograph.model.premises.same_program import same_function
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.model.trigger import AbstractTrigger, Periodic
-from heliograph.model.unknown_start import UnknownStart
 from heliograph.numerics.module import are_same
 from heliograph.numerics.numpy_or_jax import EQUAL, equal_to_rounding, is_traced
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -47,7 +47,7 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     """
     # `order`: up to which moments the filter uses the laws of noises; None for the laws as a whole.
     order, own = believed.order, _enlarge_world_by_past(believed, own)
-    parts = [] if _test_all_steps(_same_plant, believed.plant, own.plant, order) else [PLANT]
+    parts = [] if _agree_at_each_step(_same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
         agree = are_same(believed.relays, own.relays) and _same_gains(believed, own)
         return (*parts, *([] if agree else [RELAYS]))
@@ -62,12 +62,12 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
     if not are_same(believed.encoder, own.encoder):
         parts.append(ENCODER)
     # Sensor and channel agree one by one, or together: what is received of the state through both may be the same.
-    sensors = _test_all_steps(_same_sensor, believed.sensor, own.sensor, order)
+    sensors = _agree_at_each_step(_same_sensor, believed.sensor, own.sensor, order)
     channels = _same_channel(believed.channel, own.channel, order, believed.trigger is None)
     if sensors and channels:
         return tuple(parts)
     observations = (believed.sensor, believed.channel), (own.sensor, own.channel)
-    if _test_all_steps(_same_observation, *observations, order):
+    if _agree_at_each_step(_same_observation, *observations, order):
         return tuple(parts)
     parts += [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree]
     return tuple(parts)
@@ -111,7 +111,7 @@ def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
     return premise.replaced(channel=at_each_step(lambda channel: Series([channel, chosen]), premise.channel))
 
 
-def _test_all_steps(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
+def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
     """Decide whether two models agree at each step; one that does not vary is the same at all of them."""
     if are_same(a, b):
         return True
@@ -151,7 +151,7 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
     """Return whether plants move a state alike: by equal matrices, or by the same function."""
     linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
-    if len(linear) == 2 and not any(isinstance(m, OfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
+    if len(linear) == 2 and not any(isinstance(m, MatrixOfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
         return equal_to_rounding(linear[0].matrix, linear[1].matrix) and equal_to_rounding(
             linear[0].input_matrix, linear[1].input_matrix
         )
@@ -181,7 +181,7 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
     if matrices[0] is not None and matrices[1] is not None:
         return equal_to_rounding(*matrices)
     # Sensors do not know how many states they measure: any number that both take will do.
-    return any(same_function(a.measure, b.measure, (n,)) for n in _find_common_length(a, b))
+    return any(same_function(a.measure, b.measure, (n,)) for n in _find_common_state_length(a, b))
 
 
 def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
@@ -192,23 +192,26 @@ def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | No
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         if not _same_noise(a.noise, b.noise, order):
             return False
-    elif not same_function(_noise_given(a), _noise_given(b), u):
+    elif not same_function(_noise_as_function_of_inputs(a), _noise_as_function_of_inputs(b), u):
         return False
     # Sensors do not know how many states they measure: any number that both take will do.
-    return any(same_function(_measure_given(a), _measure_given(b), (n,), u) for n in _find_common_length(a, b))
+    return any(
+        same_function(_measure_as_function_of_inputs(a), _measure_as_function_of_inputs(b), (n,), u)
+        for n in _find_common_state_length(a, b)
+    )
 
 
-def _noise_given(sensor: AbstractSensor) -> Callable[[jax.Array], object]:
+def _noise_as_function_of_inputs(sensor: AbstractSensor) -> Callable[[jax.Array], object]:
     """Return the covariance of a sensor's noise as a function of its inputs."""
     return lambda u: sensor.given(u).noise.covariance
 
 
-def _measure_given(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], object]:
+def _measure_as_function_of_inputs(sensor: AbstractSensor) -> Callable[[jax.Array, jax.Array], object]:
     """Return what a sensor measures as a function of state and inputs."""
     return lambda x, u: sensor.given(u).measure(x)
 
 
-def _find_common_length(*sensors: AbstractSensor) -> list[int]:
+def _find_common_state_length(*sensors: AbstractSensor) -> list[int]:
     """Return the least number of states up to 32 that both sensors take, in a list; [] if there is none."""
     return [n for n in range(1, 33) if all(_takes_states(sensor, n) for sensor in sensors)][:1]
 
@@ -258,7 +261,7 @@ def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> boo
         return True
     if first(a).remembers or first(b).remembers:
         return False
-    return _test_all_steps(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
+    return _agree_at_each_step(lambda x, y, o: _same_map(x, y, o, loses), a, b, order)
 
 
 def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | None, loses: bool) -> bool:

@@ -9,13 +9,13 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from heliograph.model.channel import Channel, perfect
-from heliograph.model.limits import Limits
+from heliograph.model.diffuse_start import TAKEN_BY, UnknownStart
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
+from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.model.trigger import AbstractTrigger
-from heliograph.model.unknown_start import TAKEN_BY, UnknownStart
 from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
@@ -54,7 +54,7 @@ class Premise:
         order: int | None = MEAN_AND_COVARIANCE,
         relays: RelayNetwork | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
-        range: Limits | None = None,
+        range: ReadingLimits | None = None,
         encoder: Words | None = None,
     ):
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
@@ -89,7 +89,7 @@ class StaticPremise:
 NOTHING = StaticPremise(None)
 
 
-class Believing(Protocol):
+class HasPremise(Protocol):
     """A filter, a schedule or a linear system, which keeps what it was made for."""
 
     @property
@@ -97,11 +97,11 @@ class Believing(Protocol):
         """The premise as it is kept."""
 
 
-B = TypeVar("B", bound=Believing)
+B = TypeVar("B", bound=HasPremise)
 P = ParamSpec("P")
 
 
-def on_premise(made: B, premise: Premise | None) -> B:
+def with_premise(made: B, premise: Premise | None) -> B:
     """Return the filter, schedule or system with this premise, and the same numbers."""
     unknown = premise is not None and isinstance(first(premise.plant).initial_covariance, UnknownStart)
     if unknown and not getattr(made, "takes_unknown_start", False):
@@ -144,6 +144,6 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
         premise = Premise(**{name: given[name] for name in parts if name in given})
         if premise.sensor is not None and premise.channel is None:
             premise.channel = perfect(len(first(premise.sensor).outputs))
-        return on_premise(make(*args, **kwargs), premise)
+        return with_premise(make(*args, **kwargs), premise)
 
     return build

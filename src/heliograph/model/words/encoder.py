@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.trigger import one_of
+from heliograph.model.trigger import read_choice
 from heliograph.numerics.check import array, check_count, fail, rank, scalar, text
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.numpy_or_jax import library
@@ -58,7 +58,7 @@ class Words(Module):
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
         # The range of the words; of a resolution D the highest word follows.
-        self.low, self.high = (np.asarray(_read_end(name, v)) for name, v in (("low", low), ("high", high)))
+        self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):
             raise fail("range of words", "low below high", f"{self.low.tolist()} and {self.high.tolist()}")
         if (bits is None) == (resolution is None):
@@ -72,7 +72,7 @@ class Words(Module):
         self.bits = check_count("bits of a word", bits)
         if self.bits > MOST_BITS:
             raise fail("bits of a word", f"at most {MOST_BITS}", self.bits)
-        self.dither = one_of("dither", dither, Dither)
+        self.dither = read_choice("dither", dither, Dither)
 
     @property
     def step(self) -> Float[np.ndarray, "..."]:
@@ -166,7 +166,7 @@ class Words(Module):
         sequence = array("sequence numbers", numbers, (None,))
         if np.any(sequence < 0) or np.any(sequence != np.round(sequence)):
             raise fail("sequence numbers", "whole numbers from 0", "others")
-        source = np.uint64(_checksum(text("node", node)))
+        source = np.uint64(_checksum_node_name(text("node", node)))
         with np.errstate(over="ignore"):
             stream = (source << np.uint64(32)) + np.arange(outputs, dtype=np.uint64)
             state = stream * np.uint64(0x9E3779B97F4A7C15)
@@ -176,12 +176,12 @@ class Words(Module):
         return self.each(self.step, outputs) * (uniform - 0.5)
 
 
-def _read_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
+def _read_range_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
     """Return an end of the range, of all components or one for each."""
     return cast(np.ndarray, array(f"{name} of the words", value, (None,) if rank(name, value) else ()))
 
 
-def _checksum(node: str) -> int:
+def _checksum_node_name(node: str) -> int:
     """Return the CRC-32 of a node's name."""
     from zlib import crc32
 

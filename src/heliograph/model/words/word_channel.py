@@ -78,15 +78,15 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     return numbers
 
 
-def find_places(channel: Channel) -> Places:
+def find_carried_components(channel: Channel) -> Places:
     """Return the component of y that each output of a channel of words carries, FLAG of a number that is no word."""
     form = WordForm(lambda flips, places: known(np.eye(flips.dimension)), known, 1)
     return rewrite_channel(first(channel), form).places
 
 
-def reader_of(channel: Channel) -> WordReader:
+def make_word_reader(channel: Channel) -> WordReader:
     """Return how the receiver behind a channel of words reads their bits."""
-    return WordReader(find_places(channel))
+    return WordReader(find_carried_components(channel))
 
 
 def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
@@ -133,7 +133,7 @@ def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> 
             rewritten = _rewrite_map(link.link, chosen.places, form)
             maps = [chosen.map if inner is link.delay else rewritten.map for inner in inner_maps(link)]
             return RewrittenMap(replace_inner_maps(link, maps), rewritten.places)
-    raise refuse_link(type(link).__name__)
+    raise make_word_link_error(type(link).__name__)
 
 
 def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
@@ -142,7 +142,7 @@ def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> Re
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
     if gain is None or float(gain) != 1.0 or not is_noiseless or not selects_one_each:
-        raise refuse_link(link.in_words() or "a gain")
+        raise make_word_link_error(link.in_words() or "a gain")
     return RewrittenMap(form.selection(matrix), tuple(places[int(np.argmax(row))] for row in matrix))
 
 
@@ -164,7 +164,7 @@ def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordFo
     return RewrittenMap(replace_inner_maps(link, [part.map for part in parts]), parts[0].places)
 
 
-def refuse_link(got: str) -> Exception:
+def make_word_link_error(got: str) -> Exception:
     """Return the error of a link that words do not pass."""
     expected = "one that words pass, which are not amplified: hg.decode_and_forward([p]), perfect(), erasure, delays"
     return fail("channel of a node with an encoder", expected, got)

@@ -9,7 +9,7 @@ from heliograph.files.messages.in_files import FileMessage, message_name
 from heliograph.files.sources.fields import decode_json, parse_arrival
 from heliograph.files.sources.reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
-from heliograph.model.checks.refusals import RefusedError
+from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value
 from heliograph.numerics.times.timestamp_order import YEAR
 from heliograph.serving.brokers.transport import LOG

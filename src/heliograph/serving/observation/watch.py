@@ -12,7 +12,7 @@ from pydantic_core import from_json
 
 from heliograph.disk.quoting import join_names
 from heliograph.fusion.network_fusion import Fusion
-from heliograph.model.checks.refusals import OF_NODES, WORDS
+from heliograph.model.checks.refusal_reasons import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in

@@ -1,22 +1,22 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .centre import CentreFilter as CentreFilter
-from .centre import CentreState as CentreState
-from .centre import FusionCentre as FusionCentre
-from .centre import find_claim_of_informed_fusion as find_claim_of_informed_fusion
-from .centre import find_claim_of_report_fusion as find_claim_of_report_fusion
-from .centre import has_data_dependent_gains as has_data_dependent_gains
 from .fused_innovation import FusedInnovation as FusedInnovation
 from .fused_innovation import following_prior as following_prior
 from .fused_innovation import make_fused_innovations as make_fused_innovations
+from .fusion_centre import CentreFilter as CentreFilter
+from .fusion_centre import CentreState as CentreState
+from .fusion_centre import FusionCentre as FusionCentre
+from .fusion_centre import find_claim_of_informed_fusion as find_claim_of_informed_fusion
+from .fusion_centre import find_claim_of_report_fusion as find_claim_of_report_fusion
+from .fusion_centre import has_data_dependent_gains as has_data_dependent_gains
 from .fusions import ReportFusion as ReportFusion
 from .fusions import StackedFusions as StackedFusions
 from .fusions import build_centre_filter as build_centre_filter
 from .fusions import build_report_fusions as build_report_fusions
 from .fusions import list_centres as list_centres
 from .fusions import list_stacked_fusions as list_stacked_fusions
-from .linearised import LinearisedCentre as LinearisedCentre
-from .linearised import LinearisedFusionState as LinearisedFusionState
+from .linearised_centre import LinearisedCentre as LinearisedCentre
+from .linearised_centre import LinearisedFusionState as LinearisedFusionState
 from .mesh import Mesh as Mesh
 from .mesh_building import DENSE as DENSE
 from .mesh_building import build_mesh as build_mesh

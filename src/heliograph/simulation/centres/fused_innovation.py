@@ -22,20 +22,20 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import find_source_filters
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 
 UNROLLED = 16  # nodes of a kind whose corrections are written out: more are a loop
 WHOLE = Gaussian, LinearBelief, AdaptiveBelief  # states whose mean and covariance are all that is known of x
 
 
-class FusedDistance(NamedTuple):
+class FusedSquaredInnovation(NamedTuple):
     """Squared innovation e' S^-1 e of a fused estimate, NaN where nothing arrived, and how many numbers arrived."""
 
     distance: jax.Array
     arrived: jax.Array
 
 
-class _Corrected(NamedTuple):
+class _CorrectedEstimate(NamedTuple):
     """The fused estimate x, predicted and corrected by some nodes.
 
     distance: sum of their e_i' S_i^-1 e_i. arrived: how many numbers they received.
@@ -67,7 +67,7 @@ class FusedInnovation(Module):
     def step(
         self, before: Gaussian, alike: Sequence[StackedFilters], states: Sequence[PyTree], z: Sequence[jax.Array],
         u: jax.Array, k: jax.Array, skip: Sequence[jax.Array | None],
-    ) -> FusedDistance:  # fmt: skip
+    ) -> FusedSquaredInnovation:  # fmt: skip
         """Return e' S^-1 e of the fused estimate `before`, predicted over step k, by the measurements of that step.
 
         Args:
@@ -80,7 +80,7 @@ class FusedInnovation(Module):
             skip: by kind, codes of the reason not to use a node's measurement (filter, node), 0 where it is used; None
                 where all are.
         """
-        corrected: _Corrected | None = None
+        corrected: _CorrectedEstimate | None = None
         for kind, f in self.sources:
             stacked, reasons = alike[kind], skip[kind]
             filters, beliefs = stacked.take_filter(f, states[kind])
@@ -90,10 +90,10 @@ class FusedInnovation(Module):
             # x = N(xf-, Pf-): predicted from the fused estimate, by the first node's model of the plant.
             if corrected is None:
                 x = _predict_by_first(filters, beliefs, before, u, k)
-                corrected = _Corrected(x, jnp.zeros(()), jnp.zeros(()))
+                corrected = _CorrectedEstimate(x, jnp.zeros(()), jnp.zeros(()))
             corrected = _correct_in_turn(corrected, filters, beliefs, received, u, k)
         assert corrected is not None  # there is at least one node
-        return FusedDistance(jnp.where(corrected.arrived > 0, corrected.distance, jnp.nan), corrected.arrived)
+        return FusedSquaredInnovation(jnp.where(corrected.arrived > 0, corrected.distance, jnp.nan), corrected.arrived)
 
 
 def _predict_by_first(
@@ -108,8 +108,13 @@ def _predict_by_first(
 
 
 def _correct_in_turn(
-    corrected: _Corrected, filters: AbstractFilter, states: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
-) -> _Corrected:
+    corrected: _CorrectedEstimate,
+    filters: AbstractFilter,
+    states: PyTree,
+    received: jax.Array,
+    u: jax.Array,
+    k: jax.Array,
+) -> _CorrectedEstimate:
     """Return x corrected by these nodes too, one after another, and with their innovations in the sums.
 
     Args:
@@ -122,12 +127,12 @@ def _correct_in_turn(
     """
     numbers, static = eqx.partition(filters, eqx.is_array)
 
-    def correct(before: _Corrected, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_Corrected, None]:
+    def correct(before: _CorrectedEstimate, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_CorrectedEstimate, None]:
         """Correct x by one node's filter, and add its squared innovation."""
         node_numbers, prior, z = row
         after, innovation = eqx.combine(node_numbers, static).correct(with_gaussian(prior, before.x), z, k)
         distance, arrived = innovation_distance(innovation)
-        return _Corrected(gaussian_of(after), before.distance + distance, before.arrived + arrived), None
+        return _CorrectedEstimate(gaussian_of(after), before.distance + distance, before.arrived + arrived), None
 
     predict = eqx.filter_vmap(lambda node, state: node.predict(state, u, k), in_axes=(eqx.if_array(0), 0))
     by_node = numbers, predict(filters, states), received

@@ -19,25 +19,25 @@ from heliograph.model.over_time import at, first, stack, structure_key
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
-from heliograph.simulation.centres.centre import (
+from heliograph.simulation.centres.fusion_centre import (
     CentreFilter,
     FusionCentre,
-    NodesFilters,
+    NodeFiltersWithoutData,
     find_claim_of_report_fusion,
     has_data_dependent_gains,
 )
-from heliograph.simulation.centres.linearised import LinearisedCentre
+from heliograph.simulation.centres.linearised_centre import LinearisedCentre
 from heliograph.simulation.centres.observation_model import (
     SeparateObservations,
     SharedObservation,
-    describe_channel,
+    compute_channel_moments,
     stack_nodes,
 )
 from heliograph.simulation.centres.uplinks import ReportsInTransit, UplinkDraws, Uplinks, build_uplinks
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.node import Node, ReceivingNode
-from heliograph.simulation.runs.side_by_side import initial_state, map_all
+from heliograph.simulation.runs.stacked_filters import initial_state, map_all
 
 
 class StackedFusions(Module):
@@ -167,7 +167,9 @@ class ReportFusion(Module):
         return (flying, filter_state), estimate, traffic, (sent, drawn.delay)
 
 
-def build_report_fusions(network: Network, step_filters: Callable[[Network], NodesFilters]) -> dict[str, ReportFusion]:
+def build_report_fusions(
+    network: Network, step_filters: Callable[[Network], NodeFiltersWithoutData]
+) -> dict[str, ReportFusion]:
     """Return the network's fusions by reports, by name, each with its uplinks and its centre.
 
     `step_filters`: as of `build_centre_filter`.
@@ -188,7 +190,7 @@ def build_report_fusions(network: Network, step_filters: Callable[[Network], Nod
 
 
 def build_centre_filter(
-    network: Network, name: str, fusion: Fusion, step_filters: Callable[[Network], NodesFilters]
+    network: Network, name: str, fusion: Fusion, step_filters: Callable[[Network], NodeFiltersWithoutData]
 ) -> CentreFilter:
     """Return the filter of the centre that receives reports for `fusion`, which has this name in the network.
 
@@ -346,7 +348,9 @@ def _model_measurements(
         # Of each node the rows of the common channel's output that it receives, -1 for those that it lacks.
         rows = network.rows
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in nodes]
-        return SharedObservation(network.common.sensor, describe_channel(network.common.channel), np.array(padded))
+        return SharedObservation(
+            network.common.sensor, compute_channel_moments(network.common.channel), np.array(padded)
+        )
     stacked = []
     for names in groups:
         members = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]

@@ -26,7 +26,14 @@ from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Bool, Float, PyTree
-from heliograph.simulation.centres.mesh_parts import (
+from heliograph.simulation.centres.late_and_quantized_messages import (
+    ArrivingEstimates,
+    MessagesOnTheWay,
+    find_event_senders,
+    gather_messages,
+    step_messages_on_the_way,
+)
+from heliograph.simulation.centres.mesh_state_and_step import (
     Ahead,
     Arrived,
     MeshState,
@@ -39,13 +46,6 @@ from heliograph.simulation.centres.mesh_parts import (
     widen_for_events,
 )
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
-from heliograph.simulation.centres.neighbour_messages import (
-    ArrivingEstimates,
-    MessagesOnTheWay,
-    find_moved_beyond,
-    gather_messages,
-    step_messages_on_the_way,
-)
 from heliograph.simulation.centres.observation_model import SeparateObservations
 
 
@@ -61,7 +61,7 @@ class Mesh(Module):
         senders: numbers of the nodes of which each node receives (node, degree), itself first.
         places: numbers in the mesh of the nodes of each group of the network that the mesh estimates at.
         nodes: their names.
-        alpha: where nodes send on events, the threshold of `find_moved_beyond`.
+        alpha: where nodes send on events, the threshold of `find_event_senders`.
         quantizer: of the estimates that are sent, stacked by node.
         needs_joint: whether the rule needs the joint covariance of all nodes' errors.
         claim: of the nodes' estimates.
@@ -81,7 +81,7 @@ class Mesh(Module):
     claim: Claim = eqx.field(static=True)
 
     @property
-    def is_long(self) -> bool:
+    def has_long_step(self) -> bool:
         """Return whether a step has too many operations for native code, in which they are written one by one."""
         n = len(first(self.plant).states)
         # About n^2 operations for each message, and N^2 twice for a joint covariance of N = nodes n numbers.
@@ -137,7 +137,7 @@ class Mesh(Module):
         measured = jnp.concatenate([self._pad_to_longest(rows) for rows in z])[self.observation_model.order]
         present = ~jnp.isnan(measured)
         # Where messages may be late or quantized: which estimates arrive, and measurements with those sent just now.
-        messages = self._keep_messages(state, jnp.asarray(arrived))
+        messages = self._gather_late_or_quantized(state, jnp.asarray(arrived))
         arrived = arrived if messages is None else messages.fresh
         # Weights and gains, none of which depends on the estimates.
         blocks = None if state.joint is None else blocks_of(state.joint, self.senders)
@@ -180,10 +180,10 @@ class Mesh(Module):
         Computed as sum_j H_j' R_j^-1 (z_j - offset_j - H_j m) - S (xb - m), `weighted` the terms of the sum, about one
         m for all nodes, `common`: so no digits of large means are lost.
         """
-        sums = self._collect_sums(weighted, arrived)
+        sums = self._sum_over_reached_nodes(weighted, arrived)
         return sums - jnp.einsum("iab,ib->ia", step.information, predicted - common)
 
-    def _keep_messages(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
+    def _gather_late_or_quantized(self, state: MeshState, arrived: jax.Array) -> ArrivingEstimates | None:
         """Return the estimates that arrive where they may be late or quantized; None where they come as they are now.
 
         `arrived`: flags, or ages where messages may be late, (node, rounds, degree).
@@ -210,8 +210,8 @@ class Mesh(Module):
         if state.sent is None or self.alpha is None:
             return now
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
-        information = jax.vmap(invert_positive_definite)(state.covariance)[self.senders]
-        moved = find_moved_beyond(self.alpha, now - state.sent, information, self.senders, self.edges.present)
+        information = jax.vmap(invert)(state.covariance)[self.senders]
+        moved = find_event_senders(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 
     def compute_step_without_estimates(
@@ -247,7 +247,7 @@ class Mesh(Module):
             covariance = jnp.asarray(exchanges[-1].covariance)
         # Information that reaches each node from the measurements, and all that its neighbours could have measured.
         data = compute_information(self.observation_model.observe(*after, jnp.asarray(k)), measured)
-        information = self._collect_sums(data.information, arrived)
+        information = self._sum_over_reached_nodes(data.information, arrived)
         complete = self.sum_over_messages(data.complete, jnp.asarray(self.edges.present))
         # The last round fuses, predicts and corrects; late estimates are rows of their own beside the nodes'.
         arrives, senders = arrived[:, -1], None
@@ -313,7 +313,7 @@ class Mesh(Module):
         padded = [r._replace(parts=_pad_to_degree(r.parts, self.senders.shape[1])) for r in by_bucket]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[self.ranks], *padded)
 
-    def _collect_sums(self, values: jax.Array, arrived: Arrived) -> jax.Array:
+    def _sum_over_reached_nodes(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of all nodes that reach it in any round, each once."""
         if self.edges.rounds == 1:
             return self.sum_over_messages(values, jnp.asarray(arrived[:, 0]))

@@ -20,8 +20,8 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import fail, instance, spread_over_names
 from heliograph.random_affine.moments.second_moments import second_order
-from heliograph.simulation.centres.centre import find_claim_of_informed_fusion
-from heliograph.simulation.centres.fixed_shares import check_decay
+from heliograph.simulation.centres.fixed_share_stability import check_error_decay
+from heliograph.simulation.centres.fusion_centre import find_claim_of_informed_fusion
 from heliograph.simulation.centres.neighbour_edges import (
     build_edges,
     find_arrival_probability,
@@ -178,7 +178,7 @@ def _check_detectability(what: str, name: str, fusion: Fusion, network: HasNodes
     squares = np.zeros((len(names), n, n))
     for i, node in enumerate(nodes):
         if isinstance(node, Node):
-            h, noise = _model_node(node)
+            h, noise = _get_gain_and_noise(node)
             squares[i] = _scale_rows(h).T @ _scale_rows(h)
             _check_noise_is_regular(f"{what}: node {names[i]!r}", noise)
     # Unstable modes that nobody upstream observes are refused, decaying ones warned of.
@@ -235,7 +235,7 @@ def _measures_mode(node: object, vector: np.ndarray) -> bool:
     """Return whether a node's own measurement shows the mode of this eigenvector."""
     if not isinstance(node, Node):
         return False
-    return bool(np.any(np.abs(_scale_rows(_model_node(node)[0]) @ vector) > RANK))
+    return bool(np.any(np.abs(_scale_rows(_get_gain_and_noise(node)[0]) @ vector) > RANK))
 
 
 def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tuple[list[str], list[str]]:
@@ -280,7 +280,7 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
     return np.asarray(h / np.where(lengths > 0, lengths, 1.0))
 
 
-def _model_node(node: Node) -> tuple[np.ndarray, np.ndarray]:
+def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Return H, the mean matrix from state to what a node receives, and R, its noise's covariance at zero signal."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
@@ -313,17 +313,19 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
     links = [None] * len(graph.edges) if link is None else list(links_by_edge(link, graph).values())
     rates = [find_arrival_probability(channel) for channel in links]
     arrival = np.array([p for p in rates if p is not None])
-    steady = all(_is_steady(node) for node in nodes if isinstance(node, Node))
+    steady = all(_measures_alike_at_each_step(node) for node in nodes if isinstance(node, Node))
     if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
         return
     # A node without a sensor measures zeros, with a noise that does not matter.
-    models = [_model_node(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes]
+    models = [
+        _get_gain_and_noise(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes
+    ]
     squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
     shares = np.asarray(fusion.rule.placed(graph).shares).T
-    check_decay(what, graph, shares, arrival, (a, q), squares)
+    check_error_decay(what, graph, shares, arrival, (a, q), squares)
 
 
-def _is_steady(node: Node) -> bool:
+def _measures_alike_at_each_step(node: Node) -> bool:
     """Return whether a node's measurement is the same at every step, and no signal adds to its noise."""
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False

@@ -33,7 +33,7 @@ from heliograph.simulation.arguments import make_run_key, read_plant_inputs
 from heliograph.simulation.centres.mesh import Mesh
 from heliograph.simulation.centres.mesh_building import build_mesh
 from heliograph.simulation.centres.mesh_check import find_claim_of_errors
-from heliograph.simulation.centres.mesh_parts import MeshStep
+from heliograph.simulation.centres.mesh_state_and_step import MeshStep
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
 from heliograph.simulation.network import Network
 
@@ -126,7 +126,7 @@ def mesh_errors(
         got = "a quantizer" if mesh.alpha is None else f"alpha {mesh.alpha:g}, by which data decide what is sent"
         raise fail(f"errors of fusion {fusion!r} before any data", "estimates that are sent at every step, as they are",
                    got)  # fmt: skip
-    flags = _check_arrivals(mesh, arrived)
+    flags = _read_arrivals(mesh, arrived)
     network.check_horizon(len(flags))
     u = read_plant_inputs(network, inputs, len(flags))
     actual, claimed, last_joint = [], [], np.zeros(())
@@ -165,7 +165,9 @@ def propagate_errors_over_time(
     for k, (arrived, u_k) in enumerate(zip(flags, u, strict=True)):
         blocks = np.asarray(blocks_of(joint.reshape(count, n, count, n), mesh.senders)) if needs_joint else None
         with jax.enable_x64(True):
-            step = to_numpy(_compute_step(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k)))
+            step = to_numpy(
+                _compute_step_when_all_is_measured(mesh, covariance, blocks, moments, arrived, u_k, np.asarray(k))
+            )
         joint = _propagate_joint(mesh, joint, step, arrived)
         covariance, moments = step.gains.covariance, step.plant
         diagonal_blocks = np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy()
@@ -174,7 +176,7 @@ def propagate_errors_over_time(
 
 
 @quickly_compiled
-def _compute_step(
+def _compute_step_when_all_is_measured(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
@@ -231,7 +233,7 @@ def best_possible(
         ValueError: no such fusion, flags of another shape.
     """
     mesh = find_mesh(network, fusion)
-    flags = _check_arrivals(mesh, arrived)
+    flags = _read_arrivals(mesh, arrived)
     u = read_plant_inputs(network, inputs, len(flags))
     # Models of plant and measurements at each step.
     with jax.enable_x64(True):
@@ -324,7 +326,7 @@ def freeze(
     old = network.meshes[fusion]
     if not old.rule.needs_joint:
         raise fail(f"fusion {fusion!r} to freeze", "best weights such as DiagonalWeights()", type(old.rule).__name__)
-    flags = _check_arrivals(mesh, arrived)
+    flags = _read_arrivals(mesh, arrived)
     if check_count("last", last) > len(flags):
         raise fail("last", f"at most the {len(flags)} steps", last)
     u = read_plant_inputs(network, inputs, len(flags))
@@ -354,7 +356,7 @@ def find_mesh(network: Network, fusion: str) -> Mesh:
     return build_mesh(network, fusion)
 
 
-def _check_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
+def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node rounds degree"]:
     """Return flags of what arrives at each step, of neighbours alone; raise where `arrived` does not fit the mesh.
 
     `arrived`: flags of this shape, or a number of steps at which everything arrives.

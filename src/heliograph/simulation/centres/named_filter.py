@@ -9,7 +9,7 @@ from heliograph.numerics.module import readable
 from heliograph.simulation.centres.node_filter import node_filter
 from heliograph.simulation.centres.uplinks import build_uplinks
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.stepping import centre_filter
+from heliograph.simulation.network_filters import centre_filter
 
 
 @readable

@@ -25,11 +25,11 @@ from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import Modes
 from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.centres.uplinks import SentReports
-from heliograph.simulation.transmission.shared_fading import (
+from heliograph.simulation.transmission.channel_draws import (
     ChannelGroup,
-    channel_groups,
     deliver_signal,
-    start,
+    group_channels,
+    start_channel,
 )
 
 Recorded = Mapping[str, SentReports | ArrayLike]
@@ -58,7 +58,7 @@ class MeshEdges(Module):
 
         def start_group(group: ChannelGroup) -> PyTree:
             """Return the initial state of one channel of a stack."""
-            return start(group.channel, key, group.checksums, group.memories)
+            return start_channel(group.channel, key, group.checksums, group.memories)
 
         return tuple(eqx.filter_vmap(start_group, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
 
@@ -184,7 +184,7 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     past = max(first(channel).past for channel in links.values())
-    return MeshEdges(channel_groups(links), slots, graph.present, fusion.rounds, past)
+    return MeshEdges(group_channels(links), slots, graph.present, fusion.rounds, past)
 
 
 def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
@@ -207,9 +207,9 @@ def check_edge(what: str, link: Channel) -> None:
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
-        _, inside = _open_link(step, Erasure | DelayedLink)
+        _, inside = _split_losses_from_link(step, Erasure | Delayed)
         for mode_link in inside.maps if isinstance(inside, Modes) else [inside]:
-            _, mode = _open_link(mode_link)
+            _, mode = _split_losses_from_link(mode_link)
             if mode.remembers or mode.past or not _is_perfect(mode):
                 expected = "messages that arrive as they are or are lost, and the receiver knows (erasure of perfect())"
                 raise fail(what, expected, type(first(link)).__name__)
@@ -217,11 +217,13 @@ def check_edge(what: str, link: Channel) -> None:
 
 def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
     """Return the delay inside a link, whose messages may also be lost; None of a link without delay."""
-    _, inside = _open_link(channel)
-    return inside if isinstance(inside, DelayedLink) else None
+    _, inside = _split_losses_from_link(channel)
+    return inside if isinstance(inside, Delayed) else None
 
 
-def _open_link(channel: AbstractRandomAffine, kinds: type | UnionType = Erasure) -> tuple[Scalar, AbstractRandomAffine]:
+def _split_losses_from_link(
+    channel: AbstractRandomAffine, kinds: type | UnionType = Erasure
+) -> tuple[Scalar, AbstractRandomAffine]:
     """Return the probability that a message passes all outer maps of these kinds, and the map inside them."""
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
@@ -234,7 +236,7 @@ def find_arrival_probability(channel: Channel | None) -> float | None:
     """Return the probability that a message arrives; None where it differs between steps or depends on earlier ones."""
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
-    chance, inside = _open_link(channel)
+    chance, inside = _split_losses_from_link(channel)
     return None if inside.erases else float(chance)
 
 
@@ -246,7 +248,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None
-    arrival, inside = _open_link(channel, Erasure | DelayedLink)
+    arrival, inside = _split_losses_from_link(channel, Erasure | Delayed)
     if not isinstance(inside, Modes):
         return None if inside.erases else 1 - float(arrival)
     chances = [find_arrival_probability(mode) for mode in inside.maps]

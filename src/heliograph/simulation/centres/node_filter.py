@@ -17,17 +17,17 @@ from heliograph.fusion.mesh.graph import Graph, graph_of
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.model.estimate import Estimate, Innovation
-from heliograph.model.premises.premise import on_premise
+from heliograph.model.premises.premise import with_premise
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.float64 import compile_in_float64, in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike
+from heliograph.simulation.centres.late_and_quantized_messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.centres.mesh import Mesh
-from heliograph.simulation.centres.mesh_parts import MeshState, NodeBucket
+from heliograph.simulation.centres.mesh_state_and_step import MeshState, NodeBucket
 from heliograph.simulation.centres.neighbour_edges import MeshEdges
-from heliograph.simulation.centres.neighbour_messages import MessagesOnTheWay, quantize_estimate
 from heliograph.simulation.centres.observation_model import SeparateObservations, stack_nodes
-from heliograph.simulation.claims import find_premise
+from heliograph.simulation.covariance_claims import find_premise
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node, ReceivingNode
 
@@ -90,7 +90,7 @@ class NodeFilter(AbstractSizedFilter):
         # Measurements z_i = M_i x + o_i + nu_i of the node and its neighbours, without padding.
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
-        sensed, _ = self._take_apart(jnp.asarray(z), state.before)
+        sensed, _ = self._split_measurements(jnp.asarray(z), state.before)
         sensors = [(i, size) for i, size in enumerate(self.measured) if size]
         if not sensors:
             return after, no_innovation()
@@ -111,7 +111,7 @@ class NodeFilter(AbstractSizedFilter):
         message = before.mean[0], before.covariance[0]
         return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
 
-    def _take_apart(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
+    def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
 
         Rows of these: the node's own, then its neighbours'. Where no message came, the mean is NaN, and the covariance
@@ -131,7 +131,7 @@ class NodeFilter(AbstractSizedFilter):
 
     def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
-        sensed, all_nodes = self._take_apart(z, before)
+        sensed, all_nodes = self._split_measurements(z, before)
         # What did not come is NaN, so that all is said to arrive.
         everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
         now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
@@ -152,7 +152,7 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     _check_can_filter_alone(f"node {node!r} of fusion {fusion!r} by itself", network, between)
-    mesh = _build_row(network, fusion, node)
+    mesh = _build_one_node_mesh(network, fusion, node)
     # What the filter receives: the node's own measurement, then a message of each neighbour.
     sizes = tuple(network.nodes[name].received for name in mesh.nodes)
     own, *of_neighbours = sizes
@@ -164,37 +164,46 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
         claim=mesh.claim,
         states=network.states,
         inputs=network.inputs,
-        received=own + sum(_count_numbers(len(network.states), size) for size in of_neighbours),
+        received=own + sum(_count_message_numbers(len(network.states), size) for size in of_neighbours),
     )
     # The claim is that of the whole network, which stands here for the node's own part of it.
-    return on_premise(filter, find_premise(network, node))
+    return with_premise(filter, find_premise(network, node))
 
 
-def _build_row(network: Network, fusion: str, node: str) -> Mesh:
-    """Return the part of a fusion between neighbours that estimates at one node, from itself and its neighbours.
+def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
+    """Return the mesh of which one node estimates, from its own measurement and its neighbours' messages.
 
-    To it every message arrives; one that did not is a message of NaN. `fusion` and `node`: names.
+    No message gets lost in it: one that did not arrive is given to the filter as a message of NaN.
+
+    Args:
+        network: the network.
+        fusion: name of the fusion between neighbours.
+        node: name of the node.
     """
     between, nodes = network.meshes[fusion], network.mesh_nodes(fusion)
     neighbours = between.neighbours or {}
-    # The node's row of the graph: itself, then its neighbours.
+    # The node's row of the graph: itself, then its neighbours, numbered as the network numbers its nodes.
     graph = graph_of(neighbours, nodes)
     i, count = nodes.index(node), 1 + len(neighbours[node])
     row = Graph(nodes, senders=graph.senders[i : i + 1, :count], present=np.ones((1, count), dtype=bool))
+    only_node = np.zeros(1, dtype=int)  # the one node that estimates stands first among the members
+    # The members: the node and its neighbours. Each has a measurement model of its own, since they may differ in
+    # structure; None without a sensor.
     names = (node, *neighbours[node])
-    # A model of its own for each of them, since they may differ in structure; None without a sensor.
     members = [network.nodes[name] for name in names]
     models = [stack_nodes([n.sensor], [n.channel]) if isinstance(n, Node) else None for n in members]
     sizes = [n.received for n in members]
+    # Without groups of channels every message arrives; a step has one exchange.
+    lossless_edges = MeshEdges(groups=(), slots=np.zeros(0, dtype=int), present=row.present, rounds=1)
     return Mesh(
         plant=network.plant,
-        buckets=(NodeBucket(between.rule.placed(row), rows=np.zeros(1, dtype=int), width=count),),
-        ranks=np.zeros(1, dtype=int),
-        edges=MeshEdges((), np.zeros(0, dtype=int), row.present, 1),
+        buckets=(NodeBucket(rule=between.rule.placed(row), rows=only_node, width=count),),
+        ranks=only_node,
+        edges=lossless_edges,
         observation_model=SeparateObservations(
             tuple(models), order=np.arange(count), size=max(1, *sizes), counts=(1,) * count
         ),
-        senders=np.arange(count)[None],
+        senders=np.arange(count)[None],  # numbered among the members
         places=((0,),),
         nodes=names,
         alpha=None,
@@ -233,11 +242,11 @@ def node_network(network: Network, node: str) -> Network:
     if text("node", node) not in nodes:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
-    received = {j: _count_numbers(len(network.states), network.nodes[j].received) for j in senders}
+    received = {j: _count_message_numbers(len(network.states), network.nodes[j].received) for j in senders}
     parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
     return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
 
 
-def _count_numbers(n: int, size: int) -> int:
+def _count_message_numbers(n: int, size: int) -> int:
     """Return how many numbers a neighbour's message has: mean (n), covariance (n, n) and measurement (size)."""
     return n + n * n + size

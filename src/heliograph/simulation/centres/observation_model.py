@@ -115,11 +115,11 @@ def stack_nodes(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Ob
     """Return the measurement models of nodes of one structure, stacked along a first axis of nodes."""
     return ObservationModel(
         stack([without_output_names(sensor) for sensor in sensors]),
-        stack([describe_channel(channel) for channel in channels]),
+        stack([compute_channel_moments(channel) for channel in channels]),
     )
 
 
-def describe_channel(channel: Channel) -> SecondOrder | OverTime:
+def compute_channel_moments(channel: Channel) -> SecondOrder | OverTime:
     """Return the second moments of the channel where all of it arrives, for each step where it varies."""
     moments: SecondOrder | OverTime = at_each_step(lambda step: second_order(step.condition_on_arrival()), channel)
     return moments

@@ -22,11 +22,15 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.arguments import read_plant_inputs
-from heliograph.simulation.centres.centre import FusionCentre
-from heliograph.simulation.centres.observation_model import ObservationModel, SeparateObservations, describe_channel
+from heliograph.simulation.centres.fusion_centre import FusionCentre
+from heliograph.simulation.centres.observation_model import (
+    ObservationModel,
+    SeparateObservations,
+    compute_channel_moments,
+)
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 
 BLOCK = 1000  # nodes that are followed together
 
@@ -121,10 +125,10 @@ def relay_tree(
         covariances, weights, relays = (list(leaves) for leaves in zip(*outputs, strict=True))
         # The relays' errors, level by level up to the root.
         level_covariances, level_weights = [np.concatenate(covariances)], [np.concatenate(weights)]
-        errors = _join_blocks(relays)
+        errors = _join_blocks_of_relays(relays)
         while len(errors.independent) > 1:
             level_covariances.append(np.asarray(errors.covariances()))
-            relay_weights, errors = _climb_level(errors, degree)
+            relay_weights, errors = _fuse_level_of_relays(errors, degree)
             level_weights.append(relay_weights)
         level_covariances.append(np.asarray(errors.covariances()))
     return RelayTree(
@@ -184,7 +188,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     # All leaves of the block from their numbers.
     nodes = eqx.filter_vmap(leaves.node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
-    channels = eqx.filter_vmap(lambda values: describe_channel(leaves.node(values).channel))(numbers)
+    channels = eqx.filter_vmap(lambda values: compute_channel_moments(leaves.node(values).channel))(numbers)
     filters = nodes.filters[leaves.filter]
     stacked = StackedFilters(filters=filters, group=0, count=1, nodes=count)
     centre = FusionCentre(
@@ -215,7 +219,7 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
     return factors.errors
 
 
-def _climb_level(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
+def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
     """Return the weights (relay, n, child, n) and the errors of the relays above nodes with these errors."""
     groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
@@ -236,7 +240,7 @@ def _weigh_children(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
     return weights, ErrorSources(*children.weigh(weights))
 
 
-def _join_blocks(blocks: list[ErrorSources]) -> ErrorSources:
+def _join_blocks_of_relays(blocks: list[ErrorSources]) -> ErrorSources:
     """Return the errors of the relays above all blocks, one after another."""
     return ErrorSources(*(np.concatenate(leaves) for leaves in zip(*blocks, strict=True)))
 

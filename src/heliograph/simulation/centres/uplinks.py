@@ -22,9 +22,9 @@ from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.moments.second_moments import SecondOrder
-from heliograph.simulation.centres.observation_model import describe_channel
+from heliograph.simulation.centres.observation_model import compute_channel_moments
 from heliograph.simulation.random_keys import CHANNEL, draw_key
-from heliograph.simulation.transmission.shared_fading import ChannelGroup, channel_groups
+from heliograph.simulation.transmission.channel_draws import ChannelGroup, group_channels
 
 
 class UplinkDraws(NamedTuple):
@@ -248,9 +248,9 @@ def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     received = tuple(link.received(n) for link in links)
     error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
     return Uplinks(
-        groups=channel_groups(named) if random else (),
+        groups=group_channels(named) if random else (),
         quantizers=stack(quantizers) if quantizers else None,
-        links=_model_links([describe_channel(channel) for channel in channels], received, error),
+        links=_make_link_models([compute_channel_moments(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links]),
         every=np.array([link.every for link in links], float),  # arguments of the program, which others share
         received=received,
@@ -258,7 +258,7 @@ def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     )
 
 
-def _model_links(
+def _make_link_models(
     known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
     """Return the centre's model of the uplinks, one for each step if any varies.
@@ -273,7 +273,7 @@ def _model_links(
 def _gather_link_moments(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     """Return the moments of all uplinks as arrays, padded with zeros where fewer numbers arrive of a node's report.
 
-    Arguments as of `_model_links`, `known` at one step.
+    Arguments as of `_make_link_models`, `known` at one step.
     """
     gains, offsets, spreads = [], [], []
     for link, size in zip(known, received, strict=True):

@@ -12,11 +12,11 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.numpy_or_jax import describe_rounded, is_traced
 from heliograph.random_affine.composite import ARROW, DIRECT
-from heliograph.random_affine.memories_of_channels import memories
-from heliograph.simulation.claims import list_other_beliefs
-from heliograph.simulation.description.single_precision_numbers import find_rounded_parts
+from heliograph.random_affine.memory import memories
+from heliograph.simulation.covariance_claims import yield_mistaken_beliefs
+from heliograph.simulation.description.rounded_to_single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node
-from heliograph.simulation.transmission.shared_fading import number_memories
+from heliograph.simulation.transmission.channel_draws import number_memory_seeds
 
 
 class DiagramLine(NamedTuple):
@@ -26,7 +26,7 @@ class DiagramLine(NamedTuple):
     words: str
 
 
-def diagram(network: HasNodes) -> list[DiagramLine]:
+def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
     """Return a line for each part of a network, in the order in which data flow: from the plant to fused estimates."""
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
@@ -46,15 +46,15 @@ def diagram(network: HasNodes) -> list[DiagramLine]:
             words = f"{type(fusion.rule).__name__} of {fusion.filter!r} of {nodes}"
         parts.append(DiagramLine(f"fused {name}", f"{words} ({claims[FUSED][name]})"))
     # What several nodes share, and numbers that lost digits.
-    parts += [DiagramLine("shared", words) for words in list_shared(network)]
-    parts += [DiagramLine("digits", words) for words in list_rounded(network)]
+    parts += [DiagramLine("shared", words) for words in list_shared_in_words(network)]
+    parts += [DiagramLine("digits", words) for words in list_rounded_numbers(network)]
     return [DiagramLine(visible(line.name), visible(line.words)) for line in parts]
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
     """Return the claim of each estimate by node and filter, with what the filter believes that is not the node's."""
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
-    for belief in list_other_beliefs(network):
+    for belief in yield_mistaken_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
     return words
 
@@ -77,12 +77,12 @@ def _list_senders(relays: RelayNetwork | None, name: str) -> str:
     return join_names(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
 
 
-def list_shared(network: HasNodes) -> list[str]:
+def list_shared_in_words(network: HasNodes) -> list[str]:
     """Return what several nodes share, in words: a common channel, or the memory of their links."""
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
     channels = {name: node.channel for name, node in network.nodes.items() if isinstance(node, Node)}
-    numbers_of = number_memories(channels)
+    numbers_of = number_memory_seeds(channels)
     # Nodes of each memory, and its name, by the number that memories have in common where they are one.
     nodes: dict[int, list[str]] = {}
     names: dict[int, str] = {}
@@ -93,7 +93,7 @@ def list_shared(network: HasNodes) -> list[str]:
     return [f"fading {names[number]}: {join_names(sharing)}" for number, sharing in nodes.items() if len(sharing) > 1]
 
 
-def list_rounded(network: HasNodes) -> list[str]:
+def list_rounded_numbers(network: HasNodes) -> list[str]:
     """Return which numbers came in rounded to single precision, with the parts that hold them."""
     return [
         f"rounded to single precision before they came in: {describe_rounded(rounded)} ({join_names(names)})"
@@ -101,12 +101,12 @@ def list_rounded(network: HasNodes) -> list[str]:
     ]
 
 
-def text_of(network: HasNodes) -> str:
+def write_diagram(network: HasNodes) -> str:
     """Return the whole diagram as lines of text."""
     return "\n".join(_format_lines(network))
 
 
-def short_text_of(network: HasNodes) -> str:
+def write_short_diagram(network: HasNodes) -> str:
     """Return the diagram cut to the lines, and their length, that any object is shown in; … stands for the rest."""
     lines = _format_lines(network)
     if len(lines) > LINES:
@@ -117,7 +117,7 @@ def short_text_of(network: HasNodes) -> str:
 
 def _format_lines(network: HasNodes) -> list[str]:
     """Return the diagram's title, and a line for each part with its name in a column."""
-    parts = diagram(network)
+    parts = list_diagram_lines(network)
     width = max(len(line.name) for line in parts)
     return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
 
@@ -132,7 +132,7 @@ def write_html_table(network: HasNodes) -> str:
     rows = (
         f'<tr><th style="text-align:left">{escape(line.name)}</th>'
         f'<td style="text-align:left">{escape(line.words)}</td></tr>'
-        for line in diagram(network)
+        for line in list_diagram_lines(network)
     )
     return f"<table><caption>{_make_title(network)}</caption>{''.join(rows)}</table>"
 

@@ -9,12 +9,12 @@ from heliograph.disk.quoting import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.words.linear_word_filter import SEEN
-from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typical
+from heliograph.filters.words.linear import SEEN
+from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.premises.agreement import CHANNEL, find_sensor_matrix
-from heliograph.model.reported_numbers import separate_told
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE
@@ -23,16 +23,16 @@ from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.modes import redraw_modes_each_step
 from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.boundedness import certify_boundedness
-from heliograph.simulation.claims import OtherBelief, list_other_beliefs
-from heliograph.simulation.declared.refit import list_declaring
-from heliograph.simulation.description.diagram import list_rounded, list_shared
-from heliograph.simulation.description.fallbacks import list_fallbacks, list_sequential
+from heliograph.simulation.covariance_claims import MistakenBelief, yield_mistaken_beliefs
+from heliograph.simulation.declared_noise.refit import list_links_declaring_noise
+from heliograph.simulation.description.angle_doubts import doubt_degrees_at_start, doubt_wide_angles_at_start
+from heliograph.simulation.description.diagram import list_rounded_numbers, list_shared_in_words
 from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
-from heliograph.simulation.description.separable import separate_nodes
-from heliograph.simulation.description.wide_angles import warn_degrees_at_start, warn_wide_at_start
+from heliograph.simulation.description.separable_nodes import separate_nodes
+from heliograph.simulation.description.slow_filters import describe_sequential_filters, explain_xla_fallbacks
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.results.overloads import find_overloads
+from heliograph.simulation.results.overloaded_words import find_overloads
 
 CANCELLED = 1e-12  # of the largest mean gain: what is left where gains cancel
 HIDDEN = 1e-9  # of the largest singular value of the observability matrix: what is smaller is rounding
@@ -64,18 +64,22 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     """
     instance("network", network, Network, "a Network")
     # What an estimate may lack: states that nothing shows, bounds, links, memories, the world, angles.
-    lines = [*_find_unobservable(network), *_doubt_boundedness(network), *_find_unheard(network)]
-    lines += [*_find_forgetful_filters(network), *_find_other_beliefs(network)]
-    lines += [Doubt(True, words) for words in (*warn_wide_at_start(network), *warn_degrees_at_start(network))]
+    lines = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
+    lines += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
+    lines += [Doubt(True, words) for words in (*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network))]
     # What is good to know: digits, what is shared, what takes long, what messages declare, what is independent.
-    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded(network)]
-    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared(network)]
-    lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in list_fallbacks(network)]
-    if sequential := list_sequential(network):
+    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded_numbers(network)]
+    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared_in_words(network)]
+    lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in explain_xla_fallbacks(network)]
+    if sequential := describe_sequential_filters(network):
         lines.append(
             Doubt(False, f"row by row however long a recording is, since not linear in its data: {sequential}")
         )
-    lines += [*_find_declared_noise(network), *_find_reservations(network), *_find_overloads(network)]
+    lines += [
+        *_doubt_declared_noise(network),
+        *_doubt_told_numbers_without_claim(network),
+        *_doubt_overloaded_words(network),
+    ]
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
@@ -85,14 +89,14 @@ def doubts_before_data(network: Network) -> list[Doubt]:
     return sorted(lines, key=lambda doubt: not doubt.serious)
 
 
-def _find_overloads(network: Network) -> Iterator[Doubt]:
+def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
     """Yield how often the words of a node are overloaded before any data, and what that may do to a claim."""
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
             yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
 
 
-def _find_unobservable(network: Network) -> Iterator[Doubt]:
+def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
     """Yield a doubt if there are directions of the state that no sensor shows within n steps, by their states' names.
 
     They are the null space of the observability matrix, the derivatives of all outputs with respect to the state.
@@ -123,7 +127,7 @@ def _find_unobservable(network: Network) -> Iterator[Doubt]:
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
-    yield from _warn_if_unbounded(network, "the mean error of every filter", True)
+    yield from _doubt_error_bound(network, "the mean error of every filter", True)
     alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
     if len(network.nodes) == 1 or not alone:
         return
@@ -132,12 +136,12 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
         return
     for name in alone:
         node = network.nodes[name]
-        yield from _warn_if_unbounded(
+        yield from _doubt_error_bound(
             Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused
         )
 
 
-def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
+def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
     """Yield a doubt where the error of the best filter of all nodes grows without end, or this cannot be decided.
 
     `what`: whose error, in words. `serious`: whether its growth is.
@@ -154,7 +158,7 @@ def _warn_if_unbounded(network: Network, what: str, serious: bool) -> Iterator[D
         yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
-def _find_unheard(network: Network) -> Iterator[Doubt]:
+def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
     """Yield doubts on sums of links whose mean gains cancel, and links of mean gain zero, useless to linear filters."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node):
@@ -176,12 +180,12 @@ def _find_unheard(network: Network) -> Iterator[Doubt]:
             yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
 
 
-def _find_declared_noise(network: Network) -> Iterator[Doubt]:
+def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield a line on the nodes whose messages declare their noise, which is taken for true."""
     names = []
     for name, node in network.nodes.items():
         told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
-        if any(list_declaring(one) for one in told):
+        if any(list_links_declaring_noise(one) for one in told):
             names.append(name)
     if names:
         who = join_names([repr(name) for name in names])
@@ -190,7 +194,7 @@ def _find_declared_noise(network: Network) -> Iterator[Doubt]:
         )
 
 
-def _find_reservations(network: Network) -> Iterator[Doubt]:
+def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
     """Yield a doubt for each node told numbers (by its messages) of which no claim can be made, with the reason."""
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or not node.filters:
@@ -201,11 +205,11 @@ def _find_reservations(network: Network) -> Iterator[Doubt]:
                 yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
 
 
-def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
+def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
     """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
-    alike: dict[tuple[bool, str, tuple[str, ...]], list[OtherBelief]] = {}
+    alike: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
-    for belief in list_other_beliefs(network):
+    for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
         alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
@@ -215,7 +219,7 @@ def _find_other_beliefs(network: Network) -> Iterator[Doubt]:
         yield Doubt(lowered, f"another world: {beliefs[0].words}{more}{consequence}")
 
 
-def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
+def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
     """Yield filters that take draws as independent over time behind a link whose gains are not."""
     for label, names in _list_forgetful_nodes(network).items():
         words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
@@ -226,7 +230,7 @@ def _find_forgetful_filters(network: Network) -> Iterator[Doubt]:
 
 def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return a channel with typical values of the numbers that messages tell, since being told takes no memory."""
-    link, _, numbers = separate_told(channel)
+    link, _, numbers = separate_told_numbers(channel)
     return believe_typical(link) if numbers else channel
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from heliograph.engine.choice import compile_on_call
-from heliograph.model.plant import AnyPlant, manifold_among
+from heliograph.model.plant import AnyPlant, read_manifold
 from heliograph.model.sensor import AnySensor, angles_of_outputs
 from heliograph.numerics.angle import wrap_angles
 from heliograph.numerics.check import array, check_count, fail, rank, scalar
@@ -78,9 +78,8 @@ def nees(
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
     m = array("mean", mean, x.shape, missing=True)
-    return _normalise_square(
-        manifold_among(angles, x.shape[-1]).difference(x, m), _broadcast_to_steps(covariance, x), x
-    )
+    errors = read_manifold(angles, x.shape[-1]).difference(x, m)
+    return _compute_normalised_square(errors, _broadcast_covariance_to_steps(covariance, x), size=x)
 
 
 def nis(
@@ -106,19 +105,21 @@ def nis(
     """
     axes = max(rank("innovation", innovation), 1)
     e = array("innovation", innovation, (None,) * axes, missing=True)
-    return _normalise_square(
-        wrap_angles(e, angles_of_outputs(angles, e.shape[-1])), _broadcast_to_steps(covariance, e), np.zeros_like(e)
-    )
+    wrapped = wrap_angles(e, angles_of_outputs(angles, e.shape[-1]))
+    covariances = _broadcast_covariance_to_steps(covariance, e)
+    return _compute_normalised_square(wrapped, covariances, size=np.zeros_like(e))  # e is no difference of numbers here
 
 
-def _broadcast_to_steps(covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]) -> Float[np.ndarray, "*steps n n"]:
+def _broadcast_covariance_to_steps(
+    covariance: ArrayLike, x: Float[np.ndarray, "*steps n"]
+) -> Float[np.ndarray, "*steps n n"]:
     """Return the covariance of each step; one matrix is that of all steps."""
     n = x.shape[-1]
     shape = (n, n) if rank("covariance", covariance) == 2 else (*x.shape, n)
     return np.broadcast_to(array("covariance", covariance, shape, missing=True), (*x.shape, n))
 
 
-def _normalise_square(
+def _compute_normalised_square(
     x: Float[np.ndarray, "*steps n"], covariance: Float[np.ndarray, "*steps n n"], size: Float[np.ndarray, "*steps n"]
 ) -> Float[np.ndarray, "*steps"]:
     """Return x' P^-1 x of each step, over the components that are not NaN; NaN where all are.

@@ -16,12 +16,12 @@ from heliograph.numerics.linalg import squared_distance
 from heliograph.numerics.types import Array, PyTree
 from heliograph.simulation.centres.uplinks import Uplink
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.results.by_name import split_by_name, uplinks_by_name
+from heliograph.simulation.results.error_statistics_by_name import StatisticsByName
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.reducer import AbstractReducer, OfStep, reduce_rows
+from heliograph.simulation.results.results_by_name import split_by_name, uplinks_by_name
 from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
-from heliograph.simulation.results.statistics_by_name import StatisticsByName
-from heliograph.simulation.runs.over_runs import over_runs
+from heliograph.simulation.runs.map_over_runs import over_runs
 
 
 class RunSums(NamedTuple):
@@ -88,12 +88,16 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> RunSums:
         """Return the sums over all runs, with filters whose covariance differs between runs first, the others last.
 
+        Each estimate is one place on the axis `part`: those of a kind of filters stand side by side, kind after kind.
+
         Args:
-            sums: what was summed over runs, by batch, (time, filter, ..., batch); without a last axis where `common`.
-            common: for each of these whether all runs share it, so that it is the value of one run.
+            sums: what was summed over runs: "pairs" (time, part, pair, batch), "nees" (time, part, batch), "failed"
+                (time, 2, part, batch), `ever` (2, part, batch), "uplinks" (..., batch), and "claimed", an array
+                (time, part of the kind, pair, batch) for each kind.
+            common: for each array whether all runs share it: then it is the value of one run, without a batch axis.
             count: number of runs in each batch.
         """
-        # A value that all runs share counts once for each run of a batch. Claimed covariances are treated below.
+        # A value that all runs share counts once for each run of a batch. Claimed covariances, left out as (), follow.
         is_shared = common.sums["claimed"]
         totals, ever = jax.tree.map(
             lambda leaf, is_common: leaf[..., None] * count if is_common else leaf,
@@ -103,7 +107,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         # Order of the kinds: those whose claimed covariance differs between runs come first (False < True).
         claimed = sums.sums["claimed"]
         order = tuple(sorted(range(len(is_shared)), key=is_shared.__getitem__))
-        # The same order for the parts of all other sums, in which each kind's estimates are side by side.
+        # The same order for the parts of all other sums.
         sizes = [values.shape[1] for values in claimed]
         parts_of_kind = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         parts = np.concatenate([parts_of_kind[i] for i in order])

@@ -11,7 +11,7 @@ from typing_extensions import TypeAliasType
 
 from heliograph.disk.quoting import label_with_unit
 from heliograph.filters.innovation import InnovationSummary, Weighed
-from heliograph.model.estimate import Estimate, is_sound
+from heliograph.model.estimate import Estimate, mask_sound_estimates
 from heliograph.model.forecast_origin import KeptOrigin, Origin
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.module import readable
@@ -19,7 +19,7 @@ from heliograph.numerics.types import units_in
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
 from heliograph.simulation.results.consistency import nees
-from heliograph.simulation.results.labelled import (
+from heliograph.simulation.results.labelled_datasets import (
     TIME,
     FilterLabels,
     check_title,
@@ -32,7 +32,7 @@ from heliograph.simulation.results.labelled import (
     read_uplinks,
     read_values,
 )
-from heliograph.simulation.results.overloads import Overloads, find_overloads
+from heliograph.simulation.results.overloaded_words import Overloads, find_overloads
 from heliograph.simulation.results.plots import (
     check_run,
     choose_filters,
@@ -43,9 +43,9 @@ from heliograph.simulation.results.plots import (
     legend_outside,
     make_panels,
 )
-from heliograph.simulation.results.record_html import draw_record
-from heliograph.simulation.results.refusals import Refusal, list_refusals
-from heliograph.simulation.results.saved import Saved
+from heliograph.simulation.results.record_html import write_record_html
+from heliograph.simulation.results.refusal_counts import Refusal, list_refusals
+from heliograph.simulation.results.saved_datasets import SavableResults
 from heliograph.simulation.results.wide_table import make_frame, read_frame
 
 if TYPE_CHECKING:  # extras
@@ -66,7 +66,7 @@ Weights = TypeAliasType("Weights", dict[str, dict[str, Weighed]])  # by node and
 
 @readable
 @dataclass(frozen=True)
-class Record(Saved):
+class Record(SavableResults):
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     Args:
@@ -82,7 +82,7 @@ class Record(Saved):
         transmissions: by simulated node with a trigger, (run, time, m): the `model.SendReason` for which a component
             was sent, negative where it was lost, 0 where it was not sent.
         refused: of a recording, by node that refused any, the number of the reason for which a reading that came counts
-            as missing (`model.checks.refusals`), 0 where it does not, (time, received); `refusals` counts them.
+            as missing (`model.checks.refusal_reasons`), 0 where it does not, (time, received); `refusals` counts them.
         weighed: of a recording, by node and filter that weighs what arrives: `value` and `variance` of its innovations
             and their `weight` in the update, (time, received) each; `outputs` summarises them.
         origin: of what `hg.run` returns, the filters' last states, from which `hg.forecast` predicts; not saved.
@@ -109,7 +109,7 @@ class Record(Saved):
 
     def _repr_html_(self) -> str:
         """Draw the estimates with their bands, for notebooks."""
-        return draw_record(self)
+        return write_record_html(self)
 
     def with_origin(self, origin: Origin) -> "Record":
         """Return the same record with the states in which its filters ended."""
@@ -190,7 +190,7 @@ class Record(Saved):
             ValueError: a recording has no truth, or there is no such filter.
         """
         errors, estimate, truth = self.errors(node, name), self.estimates[node][name], np.asarray(self.truth)
-        sound = is_sound(estimate)[..., None]
+        sound = mask_sound_estimates(estimate)[..., None]
         if estimate.claim == "none":
             return np.full(errors.shape[:-1], np.nan)
         claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
@@ -374,7 +374,10 @@ class Record(Saved):
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 what = "mean" if estimate.claim == "none" else "covariance"
-                lines += [f"{node}/{name}: no valid {what} {when}" for when in describe_bad_steps(~is_sound(estimate))]
+                lines += [
+                    f"{node}/{name}: no valid {what} {when}"
+                    for when in describe_bad_steps(~mask_sound_estimates(estimate))
+                ]
         # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):

@@ -48,7 +48,7 @@ class DrawableRecord(Protocol):
         """Return one of the runs."""
 
 
-def draw_record(record: DrawableRecord) -> str:
+def write_record_html(record: DrawableRecord) -> str:
     """Draw the estimates of the first node that has any: means with bands of two claimed deviations, and the truth.
 
     Args:
@@ -72,7 +72,7 @@ def draw_record(record: DrawableRecord) -> str:
     notes = [f"{count} more {what}" for what, count in left_out.items() if count > 0]
     notes += [f"{len(chosen)} rows of {rows} drawn"] if len(chosen) < rows else []
     # A panel for each state, and the first and last time below.
-    panels = [_draw_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
+    panels = [_write_panel(one, filters, i, chosen) for i in range(min(len(one.states), PANELS))]
     times = "".join(f"<span>{escape(time)}</span>" for time in format_times(record.time[[0, -1]]))
     note = f"<div>{escape('; '.join(notes))}</div>" if notes else ""
     return (
@@ -97,7 +97,7 @@ def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str
     return f"<div>{''.join(marks)}</div>"
 
 
-def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
+def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
     """Return one state as HTML: its name and last value, the range of its axis, and the drawing.
 
     Args:
@@ -119,10 +119,10 @@ def _draw_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: 
     parts = []
     for colour, (mean, lower, upper) in zip(COLOURS, curves, strict=False):
         parts += [f'<path d="{d}" fill="{colour}" fill-opacity="0.2" stroke="none"/>'
-                  for d in _draw_outlines(to_height(lower), to_height(upper))]  # fmt: skip
-        parts.append(_draw_line(to_height(mean), colour))
+                  for d in _yield_band_paths(to_height(lower), to_height(upper))]  # fmt: skip
+        parts.append(_write_curve_path(to_height(mean), colour))
     if truth is not None:
-        parts.append(_draw_line(to_height(truth), "currentColor", ' stroke-dasharray="4 3"'))
+        parts.append(_write_curve_path(to_height(truth), "currentColor", ' stroke-dasharray="4 3"'))
     # Last mean of the first filter, with half of its band.
     (mean, _, upper), *_ = curves
     last = f"{mean[-1]:.4g}" + (f" ± {upper[-1] - mean[-1]:.2g}" if np.isfinite(upper[-1]) else "")
@@ -169,7 +169,7 @@ def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
     yield from (piece for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(piece))
 
 
-def _draw_line(y: np.ndarray, colour: str, attributes: str = "") -> str:
+def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
     """Return a curve of heights y as an SVG path with more attributes, broken where there is no value."""
     x = _compute_x_places(len(y))
     d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
@@ -179,7 +179,7 @@ def _draw_line(y: np.ndarray, colour: str, attributes: str = "") -> str:
     )
 
 
-def _draw_outlines(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
+def _yield_band_paths(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
     """Yield the outlines of a band between two curves of heights, as SVG paths, one for each piece without a gap."""
     x = _compute_x_places(len(lower))
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):

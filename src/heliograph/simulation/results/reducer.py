@@ -16,16 +16,16 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module, readable, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.by_name import (
-    collect_modes,
-    collect_weighed,
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.results_by_name import (
+    collect_mode_probabilities,
+    collect_weighted_innovations,
     reports_by_name,
     split_by_name,
     split_measurements,
     transmissions_by_name,
     uplinks_by_name,
 )
-from heliograph.simulation.results.record import Record
 
 Result = TypeVar("Result", default=Record)  # of the reducer; a record where there is none
 
@@ -161,7 +161,7 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
     # The axis of filters is the third from last of means (..., filter, node, n), the fourth of covariances.
     mean = split_by_name(network, batch, attrgetter("mean"), axis=-3)
     covariance = split_by_name(network, batch, attrgetter("covariance"), axis=-4)
-    modes, attitude = collect_modes(network, batch), first(network.plant).manifold.rotations
+    modes, attitude = collect_mode_probabilities(network, batch), first(network.plant).manifold.rotations
     estimates = {
         node: {
             name: Estimate(mean[node][name], covariance[node][name], claim, modes.get((node, name)), attitude=attitude)
@@ -179,5 +179,5 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         uplinks=uplinks,
         reports=reports,
         transmissions=transmissions_by_name(network, batch.get("transmissions", {})),
-        weighed=collect_weighed(network, batch),
+        weighed=collect_weighted_innovations(network, batch),
     )

@@ -11,7 +11,7 @@ from heliograph.simulation.centres.uplinks import Uplink
 
 if TYPE_CHECKING:
     import pandas as pd
-from heliograph.simulation.results.labelled import SENT
+from heliograph.simulation.results.labelled_datasets import SENT
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]  # of a table's columns; "" where one does not apply
 Column = tuple[str, str, str, str, str]  # labels of a column, one for each of LEVELS

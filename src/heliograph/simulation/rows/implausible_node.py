@@ -1,4 +1,4 @@
-"""Which node a row's implausible values are of, where a central filter judges those of all nodes together."""
+"""Which node is to blame for an implausible row, where a central filter judges the values of all nodes together."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,10 +11,10 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.runs.side_by_side import filter_step, map_all
+from heliograph.simulation.runs.stacked_filters import filter_step, map_all
 
 
-def refuse_centrally(
+def blame_nodes_for_implausible_rows(
     filters: Mapping[str, AbstractFilter],
     before: Mapping[str, PyTree],
     z: Mapping[str, Float[np.ndarray, "steps m"]],
@@ -38,7 +38,7 @@ def refuse_centrally(
         The rows of each node that is to blame, with the reason.
     """
     # One trial for each implausible row and each of these nodes that has a value in it: the row without the node's.
-    removals = [_Removal(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
+    removals = [_RowWithoutNode(k, name) for k in why for name in nodes if not np.isnan(z[name][k]).all()]
     rows = np.array([removal.row for removal in removals], dtype=int)
     without = {name: values[rows] for name, values in z.items()}
     for i, removal in enumerate(removals):
@@ -47,7 +47,7 @@ def refuse_centrally(
     votes = _judge_rows(filters, before, np.concatenate(list(without.values()), axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
 
-    def find_largest(removal: _Removal) -> float:
+    def find_largest(removal: _RowWithoutNode) -> float:
         """Return the largest size of the values removed."""
         return float(np.nanmax(np.abs(z[removal.node][removal.row])))
 
@@ -59,7 +59,7 @@ def refuse_centrally(
     return refused
 
 
-class _Removal(NamedTuple):
+class _RowWithoutNode(NamedTuple):
     """A row without the values of one node."""
 
     row: int

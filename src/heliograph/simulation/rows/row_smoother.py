@@ -24,11 +24,11 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.centres.fusions import StackedFusions
+from heliograph.simulation.implausible_data import read_refusal_reasons
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import read_reasons
+from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.rows.row_history import RowHistory
 from heliograph.simulation.rows.row_step import NetworkStep
-from heliograph.simulation.stepping import AllFilters
 
 NetworkSmootherStep: TypeAlias = "tuple[dict[int, SmootherStep], dict[str, SmootherStep]]"  # by kind, and by name
 
@@ -62,7 +62,7 @@ class BackwardSweep(Module):
         Returns:
             The filters' states after the step, and their smoother steps.
         """
-        by_kind, central = read_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
+        by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
         after, outputs = self.network_step.filters.step(
             state, self.network_step.group_measurements(received), u, k, skip=skip

@@ -17,12 +17,12 @@ from heliograph.numerics.trees.flattened_trees import FlatLayout, flatten_to_row
 from heliograph.numerics.trees.program_text import write_program_text
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
-from heliograph.simulation.description.remarks import find_remarking, list_remarks
+from heliograph.simulation.description.filter_remarks import find_remarking_filters, yield_remarks
+from heliograph.simulation.implausible_data import step_plausibly
 from heliograph.simulation.network import Network
-from heliograph.simulation.plausible_step import step_plausibly
-from heliograph.simulation.rows.columns import find_filter_columns
+from heliograph.simulation.network_filters import AllFilters, initial_states
+from heliograph.simulation.rows.output_columns import find_filter_columns
 from heliograph.simulation.rows.row_history import RowHistory
-from heliograph.simulation.stepping import AllFilters, initial_states
 
 OUTPUTS = "estimates", "fused", "judged", "judged_centrally", "weighed", "weighed_centrally", "tested"
 TEXTS = 16  # programs held as text, of up to a megabyte each
@@ -159,7 +159,7 @@ class RowStep:
     @cached_property
     def remarking(self) -> tuple[tuple[str, str], ...]:
         """Return node and name of each filter that may say what happened to its state."""
-        return find_remarking(self._network)
+        return find_remarking_filters(self._network)
 
     def read_remarks(self, state: Float[np.ndarray, " state"]) -> dict[tuple[str, str], Remark]:
         """Return what each of these filters says of its state, by node and name.
@@ -167,7 +167,7 @@ class RowStep:
         Args:
             state: the states after a row, as they are laid out.
         """
-        return dict(list_remarks(self._network, self.state.tree(state)))
+        return dict(yield_remarks(self._network, self.state.tree(state)))
 
     @cached_property
     def program(self) -> str:
@@ -254,14 +254,16 @@ def _make_shape(shape: tuple[int, ...], dtype: Any) -> Any:
 
 @lru_cache
 def _make_step(layout: RowLayout) -> Any:
-    """Return the function (numbers, row) -> (states, outputs), traced once for the outputs' layout, code and text.
+    """Return the compiled function (numbers, row) -> (states after the row, outputs) of networks of one structure.
 
-    `numbers`: the arrays of the network's step.
+    `numbers` are the arrays of a network's step: networks that differ in these alone share the function, and its trace
+    serves the layout of the outputs, the native code and the program's text.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        stepped: tuple[PyTree, PyTree] = layout.static.with_arrays(numbers).step(*layout.split_row(row))
+        network_step = layout.static.filled(numbers)  # the structure with these arrays put back into it
+        stepped: tuple[PyTree, PyTree] = network_step.step(*layout.split_row(row))
         return stepped
 
     return jax.jit(step, inline=True)

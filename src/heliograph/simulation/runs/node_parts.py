@@ -14,11 +14,11 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import number_unnamed_memories
 from heliograph.simulation.network import Network
-from heliograph.simulation.network_index import FilterKind, find_estimate_places
+from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.network_index import AlikeFilters, find_estimate_places
 from heliograph.simulation.node import Node
-from heliograph.simulation.runs.side_by_side import StackedFilters
+from heliograph.simulation.runs.stacked_filters import StackedFilters
 from heliograph.simulation.simulation_step import World
-from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.transmission.build_reception import make_reception
 from heliograph.simulation.transmission.reception import SeparateChannels
 
@@ -73,7 +73,7 @@ def _on_host(leaf: PyTree) -> PyTree:
 def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
     """Return the network of these nodes alone, which are of one structure; unchecked, since the whole network is."""
     group = next(g for g, members in enumerate(network.groups) if names[0] in members)
-    kinds = tuple(FilterKind(0, kind.filters) for kind in network.kinds if kind.group == group)
+    kinds = tuple(AlikeFilters(0, kind.filters) for kind in network.kinds if kind.group == group)
     size = network.nodes[names[0]].received
     claimed = {(name, f): network.claimed[name, f] for name in names for f in network.nodes[name].filters}
     return _with_fields(

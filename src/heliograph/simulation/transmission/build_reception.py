@@ -8,20 +8,20 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import stack
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor, without_output_names
-from heliograph.model.words.word_channel import reader_of, rewrite_in_bits
+from heliograph.model.words.word_channel import make_word_reader, rewrite_in_bits
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import drop_names, memories
 from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import checksum
+from heliograph.simulation.transmission.channel_draws import number_memory_seeds
 from heliograph.simulation.transmission.reception import (
     AbstractMedium,
     CommonChannel,
     NodeGroup,
-    NoSensor,
+    NodesWithoutSensor,
     SeparateChannels,
 )
-from heliograph.simulation.transmission.shared_fading import number_memories
 from heliograph.simulation.transmission.slotted_relays import SlottedRelays, find_hops_with_memory
 
 
@@ -35,12 +35,16 @@ def make_reception(network: Network) -> AbstractMedium:
         return CommonChannel(network.common.sensor, network.common.channel, received)
     # A sensor and a channel for each node, stacked by group.
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    memories_of = number_memories({name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant)
+    memories_of = number_memory_seeds(
+        {name: (node.sensor, node.channel) for name, node in nodes.items()}, network.plant
+    )
     groups = [[name for name in names if name in nodes] for names in network.groups]
-    return SeparateChannels(tuple(
-        _stack_group(network, {name: nodes[name] for name in sensing}, memories_of) if sensing else NoSensor(len(names))
-        for sensing, names in zip(groups, network.groups, strict=True)
-    ))  # fmt: skip
+    # A group has the same structure in all its nodes: all of them have a sensor, or none has.
+    media: list[NodeGroup | NodesWithoutSensor] = []
+    for sensing, names in zip(groups, network.groups, strict=True):
+        of_group = {name: nodes[name] for name in sensing}
+        media.append(_stack_group(network, of_group, memories_of) if sensing else NodesWithoutSensor(len(names)))
+    return SeparateChannels(tuple(media))
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
@@ -50,7 +54,7 @@ def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
         relays=relays,
         estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
         groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memories=number_memories({name: hop.channel for name, hop in find_hops_with_memory(relays).items()}),
+        memories=number_memory_seeds({name: hop.channel for name, hop in find_hops_with_memory(relays).items()}),
     )
 
 
@@ -88,7 +92,7 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
         trigger=None if triggers[0] is None else stack(triggers),
         encoder=None if encoders[0] is None else stack(encoders),
         informed_at=None if place is None else (place.kind, place.filter),
-        reader=None if encoders[0] is None else reader_of(first_node.channel),
+        reader=None if encoders[0] is None else make_word_reader(first_node.channel),
     )
 
 

@@ -28,8 +28,8 @@ from heliograph.numerics.module import Module, unwritten
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
-from heliograph.simulation.runs.side_by_side import map_all
-from heliograph.simulation.transmission.shared_fading import deliver_signal, move_modes, start, start_modes
+from heliograph.simulation.runs.stacked_filters import map_all
+from heliograph.simulation.transmission.channel_draws import deliver_signal, move_modes, start_channel, start_modes
 
 Measurements = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -96,7 +96,7 @@ class NodeGroup(Module):
     reader: WordReader | None = eqx.field(static=True)
 
 
-class NoSensor(Module):
+class NodesWithoutSensor(Module):
     """Nodes without a sensor."""
 
     count: int = eqx.field(static=True)
@@ -122,22 +122,22 @@ class LinkState(NamedTuple):
 class SeparateChannels(AbstractMedium):
     """Medium of nodes with a sensor and a channel each."""
 
-    groups: tuple[NodeGroup | NoSensor, ...]
+    groups: tuple[NodeGroup | NodesWithoutSensor, ...]
 
     def init(self, key: jax.Array) -> PyTree:
         """Return the links' states before the first step by group, (node, ...); () of nodes without a sensor."""
 
         def start_node(group: NodeGroup) -> LinkState:
             """Return the initial state of one node's link."""
-            feed_back = None if group.reference_filter is None else _first_mean(group.reference_filter)
+            feed_back = None if group.reference_filter is None else _get_initial_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
             modes = start_modes(group.sensor, key, group.modes)
-            memory = start(group.channel, key, group.checksums, group.memories)
+            memory = start_channel(group.channel, key, group.checksums, group.memories)
             return LinkState(memory=memory, feed_back=feed_back, sender=sender, modes=modes)
 
         return tuple(
-            () if isinstance(group, NoSensor) else map_all(start_node, len(group.checksums))(group)
+            () if isinstance(group, NodesWithoutSensor) else map_all(start_node, len(group.checksums))(group)
             for group in self.groups
         )
 
@@ -146,9 +146,9 @@ class SeparateChannels(AbstractMedium):
     ) -> tuple[PyTree, Measurements]:
         """Measure x at each node, and deliver what it sends through its channel; arguments and results as above."""
 
-        def receive_group(group: NodeGroup | NoSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
+        def receive_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
             """Return the links of one group after the step, and what its nodes receive."""
-            if isinstance(group, NoSensor):
+            if isinstance(group, NodesWithoutSensor):
                 return link, jnp.zeros((group.count, 0))
             transmit = map_all(lambda node, state: _transmit(node, state, x, u, key, k), len(group.checksums))
             return cast(tuple[PyTree, jax.Array], transmit(group, link))
@@ -159,7 +159,7 @@ class SeparateChannels(AbstractMedium):
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
         """Return the state with the present estimate of each filter that is fed back to its sensor."""
 
-        def feed_group(group: NodeGroup | NoSensor, link: PyTree) -> PyTree:
+        def feed_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> PyTree:
             """Return the links of one group with their filters' estimates."""
             if group.informed_at is None:
                 return link
@@ -221,7 +221,7 @@ def _send_through_channel(
     return words, group.reader.read_words(group.encoder, len(y), received), memory
 
 
-def _first_mean(filter: AbstractFilter) -> jax.Array:
+def _get_initial_mean(filter: AbstractFilter) -> jax.Array:
     """Return a filter's mean before the first step."""
     return jnp.asarray(filter.estimate(filter.init()).mean)
 
@@ -240,7 +240,7 @@ class CommonChannel(AbstractMedium):
 
     def init(self, key: jax.Array) -> PyTree:
         """Return the past signals of a late channel; the channel has no other memory."""
-        return start(self.channel, key, checksum(SENDER), ())
+        return start_channel(self.channel, key, checksum(SENDER), ())
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from heliograph.model.words.word_channel import FLAG, find_places
+from heliograph.model.words.word_channel import FLAG, find_carried_components
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
@@ -24,7 +24,7 @@ def refuse_shared_dithers(network: Network, z: Mapping[str, Float[np.ndarray, "s
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or node.encoder is None or not node.encoder.subtracts:
             continue
-        places = [place for place in find_places(node.channel) if place != FLAG]
+        places = [place for place in find_carried_components(node.channel) if place != FLAG]
         for component in dict.fromkeys(places):  # copies of a word have one dither
             # Dithers stand at the end of what is received.
             drawn = z[name][:, node.received - len(places) + places.index(component)]

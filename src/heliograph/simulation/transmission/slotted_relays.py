@@ -16,8 +16,8 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
+from heliograph.simulation.transmission.channel_draws import deliver_signal, start_channel
 from heliograph.simulation.transmission.reception import AbstractMedium, Measurements
-from heliograph.simulation.transmission.shared_fading import deliver_signal, start
 
 
 class RelayStates(NamedTuple):
@@ -48,7 +48,7 @@ class SlottedRelays(AbstractMedium):
         """Return the initial mean as every relay's estimate, and the hops' initial states."""
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
-            name: start(hop.channel, key, hop.source, self.memories[name])
+            name: start_channel(hop.channel, key, hop.source, self.memories[name])
             for name, hop in find_hops_with_memory(self.relays).items()
         }
         return RelayStates(jnp.tile(mean, (len(self.estimates_at), 1)), hops)

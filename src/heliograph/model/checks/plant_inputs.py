@@ -1,0 +1,298 @@
+"""Inputs of a plant: a time step that does not go backwards, and what the plant's functions return for them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.input_dependent_sensor import NoiseOfInputs
+from heliograph.model.markov_jump_models import list_mode_models
+from heliograph.model.over_time import at, first, stack_over_time
+from heliograph.model.plant import TIME_STEP, AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, matrix_under_inputs
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, fail, standard_deviations
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.linalg import rounding
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.noise import AbstractNoise
+
+LONGEST = 2.0**53  # units of a time step; a double counts no time beyond it
+WRAPPED = 2.0**32  # a difference of unsigned counters of 32 bits that is -d reads 2^32 - d
+NEAR = 2.0**24  # how far below 2^32 a whole number of units is taken for such a difference
+SMALLER = (1e3, 1e6)  # counts in a unit of dt, of a counter of milliseconds or microseconds in seconds
+CLOSE = 2.0**10  # how far below 2^32 a number of such counts is: few steps are of 49.7 days so exactly
+ROWS = 4096  # of inputs for which functions are computed at once
+MOST_SHOWN = 100  # characters of a matrix
+LOOSE = 100.0  # times the tolerances of eigenvalues: elimination rounds by more than they do
+
+ModelMatrixFunction = Callable[[Any, jax.Array], jax.Array]  # of a plant or a sensor, and its inputs
+
+
+class TimeStepFault(NamedTuple):
+    """A row whose time step is none: its number from 0, what was expected, and what came."""
+
+    row: int
+    expected: str
+    came: str
+
+
+def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> TimeStepFault | None:
+    """Return the first time step that is none: one that goes backwards, a counter that wrapped, one beyond 2^53."""
+    bad = ~np.asarray(_is_time_step(dt))
+    if not bad.any():
+        return None
+    row = int(np.argmax(bad))
+    got = f"{dt[row]:.10g}"
+    if dt[row] < 0:
+        return TimeStepFault(row, "a time step that does not go backwards", got)
+    if dt[row] > LONGEST:
+        return TimeStepFault(row, "a time step of at most 2^53 units, as far as a double counts", got)
+    # In counts of the unit that it is nearest to 2^32 in.
+    counts = min((1.0, *SMALLER), key=lambda counts: abs(dt[row] * counts - WRAPPED))
+    below = f"{round(dt[row] * counts - WRAPPED)}" + (f" / {counts:g}" if counts > 1 else "")
+    return TimeStepFault(row, "a time step", f"{got}: {below} as a difference of unsigned counters of 32 bits")
+
+
+def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
+    """Raise ValueError unless each time step, the input "dt", is a number from 0 to 2^53 and no counter that wrapped.
+
+    Args:
+        names: names of the inputs.
+        u: one row of inputs (inputs,), or rows (steps, inputs).
+    """
+    if TIME_STEP not in names or isinstance(u, jax.core.Tracer):
+        return
+    fault = find_time_step_fault(np.atleast_2d(np.asarray(u))[:, list(names).index(TIME_STEP)])
+    if fault is not None:
+        where = f"input {TIME_STEP!r}" + (f", row {fault.row + 1}" if np.ndim(u) > 1 else "")
+        raise fail(where, fault.expected, fault.came)
+
+
+def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
+    """Return whether each number is from 0 to 2^53, and no difference of unsigned counters below zero.
+
+    `precision`: of the numbers.
+    """
+    wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
+    for counts in SMALLER:
+        wrapped = wrapped | _is_near_wrap(dt, counts, CLOSE, precision)
+    return (dt >= 0) & (dt <= LONGEST) & ~wrapped
+
+
+def _is_near_wrap(dt: Array, counts: float, near: float, precision: type) -> Array:
+    """Return whether each time step is so many counts below 2^32, rounded as the precision has them."""
+    ends = [float(precision((WRAPPED - below) / counts)) for below in (near, 0.5)]
+    return (dt >= ends[0]) & (dt <= ends[1])
+
+
+def check_inputs(
+    names: Sequence[str], u: Float[Array, "steps inputs"], models: PyTree, step: int | np.ndarray = 0
+) -> None:
+    """Raise ValueError where a time step is none, or a plant's function of the inputs returns what it must not.
+
+    Args:
+        names: names of the inputs.
+        u: the inputs of consecutive steps (steps, inputs).
+        models: a filter, nodes or anything else that holds plants with these inputs.
+        step: number of the first of the steps, or of each (steps,).
+    """
+    if isinstance(u, jax.core.Tracer) or not len(names):
+        return
+    u = np.asarray(u)
+    check_time_step(names, u)
+    steps = np.arange(len(u)) + step if np.ndim(step) == 0 else np.asarray(step)
+    known: set[int] = set()
+    for plant in yield_plants(models):
+        if id(plant) not in known and first(plant).inputs == tuple(names):
+            _check_functions_of_inputs(plant, u, steps)
+        known.add(id(plant))
+    for sensor, places in _sensors_of_inputs(models, names):
+        if id(sensor) not in known:
+            _check_functions_of_inputs(sensor, u[:, places], steps)
+        known.add(id(sensor))
+
+
+def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
+    """Yield the sensors that depend on some of these inputs, and the places of those."""
+    for sensor in yield_models_of_class(models, AbstractSensor):
+        own = first(sensor).inputs
+        if own and set(own) <= set(names):
+            yield sensor, [list(names).index(name) for name in own]
+
+
+def yield_plants(models: PyTree) -> Iterator[AnyPlant]:
+    """Yield the plants that a model object holds; of one with modes its laws of motion."""
+    for plant in yield_models_of_class(models, AbstractPlant):
+        yield from list_mode_models(plant)
+
+
+def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
+    """Yield what a model object holds of a class of models, constant or over time."""
+
+    def is_part(part: object) -> bool:
+        """Return whether an object is of the class, constant or over time."""
+        return isinstance(stack_over_time(part), kind)
+
+    yield from (part for part in jax.tree.leaves(models, is_leaf=is_part) if is_part(part))
+
+
+def _list_functions_of_inputs(model: AbstractPlant | AbstractSensor) -> dict[str, ModelMatrixFunction]:
+    """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
+    every: dict[str, ModelMatrixFunction] = {}
+    if isinstance(model, AbstractSensor):
+        if isinstance(model, LinearSensor) and isinstance(model.matrix, MatrixOfInputs):
+            every["sensor matrix(u)"] = _sensor_matrix
+        if isinstance(model.noise, NoiseOfInputs):
+            every[SENSOR_NOISE] = _sensor_noise
+        return every
+    if isinstance(model, LinearPlant):
+        if isinstance(model.matrix, MatrixOfInputs):
+            every["plant matrix(u)"] = LinearPlant.transition_matrix
+        if isinstance(model.input_matrix, MatrixOfInputs):
+            every["input matrix(u)"] = _input_matrix
+    if not isinstance(model.noise, AbstractNoise):
+        every[NOISE] = AbstractPlant.noise_covariance
+    return every
+
+
+NOISE, SENSOR_NOISE = "process noise covariance(u)", "sensor noise covariance(u)"
+COVARIANCES = NOISE, SENSOR_NOISE
+
+
+def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
+    """Return C(u) of a linear sensor."""
+    return matrix_under_inputs(sensor.matrix, u)
+
+
+def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
+    """Return the noise's covariance of a sensor of inputs, under its inputs u."""
+    assert isinstance(sensor.noise, NoiseOfInputs)
+    return sensor.noise.given(u)
+
+
+def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
+    """Return B of a linear plant under the inputs u."""
+    assert isinstance(plant, LinearPlant)
+    return matrix_under_inputs(plant.input_matrix, u)
+
+
+def _check_functions_of_inputs(
+    plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray
+) -> None:
+    """Raise ValueError that names the row whose inputs u give a matrix that is not finite, or no covariance."""
+    functions = _list_functions_of_inputs(first(plant))
+    parts = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
+    for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
+        wrong = mask_invalid_covariances(values) if name in COVARIANCES else ~np.isfinite(values).all(axis=(1, 2))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            given = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
+            where = f"row {row + 1}" if len(u) > 1 else f"step {steps[0]}"
+            came = f"{_shorten(values[row])} in {where}, for {given}"
+            raise fail(name, "a covariance" if name in COVARIANCES else "finite numbers", came)
+
+
+def _evaluate_in_blocks_of_steps(
+    plant: AnyPlant | AnySensor,
+    functions: tuple[ModelMatrixFunction, ...],
+    u: Float[np.ndarray, "steps inputs"],
+    steps: np.ndarray,
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yield what functions return, some steps at a time."""
+    for start in range(0, len(u), ROWS):
+        yield _evaluate_at_steps(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
+
+
+@compile_in_float64
+def _evaluate_at_steps(
+    plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
+) -> Any:
+    """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
+
+    def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
+        """Return what the functions return at step k."""
+        now = at(plant, k)
+        return tuple(function(now, u_k) for function in functions)
+
+    return jax.vmap(of_step)(jnp.asarray(steps), jnp.asarray(u))
+
+
+def _shorten(value: np.ndarray) -> str:
+    """Return a matrix as text of at most MOST_SHOWN characters."""
+    shown = str(np.round(value, 12).tolist())
+    return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
+
+
+def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
+    """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
+    finite = np.isfinite(values).all(axis=(1, 2))
+    safe = np.where(finite[:, None, None], values, 0.0)
+    unit = standard_deviations(safe)
+    correlations = safe / (unit[:, :, None] * unit[:, None, :])
+    skew = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0.0)
+    smallest = np.linalg.eigvalsh((correlations + np.swapaxes(correlations, 1, 2)) / 2)[:, 0]
+    wrong: np.ndarray = ~finite | (skew > SYMMETRY_TOLERANCE) | (smallest < -DEFINITENESS_TOLERANCE)
+    return wrong
+
+
+def do_inputs_spoil(
+    model: PyTree, names: Sequence[str], u: jax.Array, k: jax.Array | int, precision: type | None = None
+) -> jax.Array:
+    """Decide in a compiled step whether the time step is none, or a function of the inputs returns what is none.
+
+    Args:
+        model: a filter, or anything else that holds plants with these inputs.
+        names: names of the inputs.
+        u: inputs of the step (inputs,).
+        k: number of the step.
+        precision: type of numbers in which the step is computed, whose rounding is allowed (default: the matrix's).
+    """
+    spoilt = jnp.asarray(False)
+    if TIME_STEP in names:
+        spoilt = ~jnp.asarray(_is_time_step(u[list(names).index(TIME_STEP)], precision or np.float64))
+    for varying in yield_plants(model):
+        plant = at(varying, k)
+        if not names or plant.inputs != tuple(names):
+            continue
+        spoilt |= _returns_invalid_value(plant, u, precision)
+    for sensor, places in _sensors_of_inputs(model, names):
+        spoilt |= _returns_invalid_value(at(sensor, k), u[np.array(places)], precision)
+    return spoilt
+
+
+def _returns_invalid_value(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
+    """Decide whether a function of a model's inputs returns what is none."""
+    spoilt = jnp.asarray(False)
+    for name, function in _list_functions_of_inputs(model).items():
+        value = function(model, u)
+        sound = _is_covariance(value, precision) if name in COVARIANCES else jnp.all(jnp.isfinite(value))
+        spoilt |= ~sound
+    return spoilt
+
+
+def _is_covariance(matrix: jax.Array, precision: type | None) -> jax.Array:
+    """Decide whether a matrix (n, n) is a covariance, by elimination of its correlations.
+
+    It has to be finite and symmetric, without a pivot below zero. Where a pivot is zero, nothing may be left of its
+    column: |c_ij|^2 <= c_ii c_jj.
+
+    Args:
+        matrix: (n, n).
+        precision: type of numbers whose rounding is allowed; None for the matrix's own.
+    """
+    variances = jnp.diagonal(matrix)
+    scale = 1 / jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    left = matrix * scale[:, None] * scale  # what elimination has left of the correlations
+    like: Array = left if precision is None else np.zeros(0, precision)
+    sound = jnp.all(jnp.isfinite(matrix)) & jnp.all(variances >= 0)
+    sound &= jnp.all(jnp.abs(left - left.T) <= rounding(LOOSE * SYMMETRY_TOLERANCE, like))
+    tolerance = rounding(LOOSE * DEFINITENESS_TOLERANCE, like, 10 * len(matrix))
+    for _ in range(len(matrix)):
+        pivot, column = left[0, 0], left[1:, 0]
+        determined = pivot <= tolerance
+        sound &= (pivot >= -tolerance) & (~determined | jnp.all(column**2 <= 2 * tolerance))
+        taken = column / jnp.where(determined, 1.0, pivot)
+        left = left[1:, 1:] - jnp.where(determined, 0.0, taken[:, None] * left[0, 1:])
+    return sound

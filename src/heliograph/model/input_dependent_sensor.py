@@ -1,0 +1,112 @@
+"""Sensors whose function, matrix or noise depends on inputs u: h(x, u), C(u), R(u); and what those without refuse."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.plant import NoiseFunction, check_shape
+from heliograph.numerics.check import array, error_text, fail, function, name_list, names
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import as_real, trace_shape
+from heliograph.numerics.types import ArrayLike, Names
+from heliograph.random_affine.noise import as_noise, count_components
+
+
+class MeasureUnderInputs(Module):
+    """x -> h(x, u) of a known u."""
+
+    function: Callable[..., ArrayLike]
+    u: jax.Array
+
+    def __call__(self, x: jax.Array) -> ArrayLike:
+        """Return h(x, u)."""
+        return self.function(x, self.u)
+
+
+class NoiseOfInputs(Module):
+    """Covariance of a sensor's noise as a function of inputs; whatever takes it for a law is refused in one line.
+
+    Args:
+        function: Cov v of u.
+        inputs: names of the inputs.
+        outputs: number of outputs.
+    """
+
+    function: NoiseFunction
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: int = eqx.field(static=True)
+
+    def given(self, u: jax.Array) -> jax.Array:
+        """Return the covariance (outputs, outputs) under u; a number stands for that variance of each."""
+        value = as_real(self.function(u))
+        return value * jnp.eye(self.outputs) if value.ndim == 0 else value
+
+    def _refuse(self) -> Any:
+        """Raise ValueError: here the noise must be a constant law."""
+        raise fail(
+            "sensor noise", "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}"
+        )
+
+    covariance = mean = columns = dimension = property(_refuse)
+
+
+def read_input_names(inputs: Names) -> tuple[str, ...]:
+    """Return names of inputs, each once."""
+    return names("inputs of a sensor", inputs, len(name_list("inputs of a sensor", inputs)), "u")
+
+
+def count_matrix_rows(matrix: object, inputs: tuple[str, ...]) -> int:
+    """Return the number of rows of a matrix, or of what a function of the inputs returns."""
+    if not callable(matrix):
+        return int(array("sensor matrix", cast(ArrayLike, matrix), ("outputs", "states")).shape[-2])
+    try:
+        shape = trace_shape("sensor matrix(u)", matrix, np.ones(len(inputs)))
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("sensor matrix(u)", "a function in operations of jax.numpy", error_text(error)) from error
+    if len(shape) != 2:
+        raise fail("sensor matrix(u)", "shape (outputs, states)", f"shape {shape}")
+    return shape[0]
+
+
+def read_noise_of_inputs(
+    noise: Any, outputs: Names | None, rows: int | None, inputs: tuple[str, ...]
+) -> tuple[tuple[str, ...], Any]:
+    """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs."""
+    # How many outputs there are, said by the sensor's matrix, or by their names, or by the noise; else it is one.
+    components = None if callable(noise) else count_components(noise)
+    count_without_matrix = (components or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+    count = rows or count_without_matrix
+    named = names("sensor outputs", outputs, count, "y")
+    if not callable(noise):
+        return named, as_noise("sensor noise", noise, count)
+    law = NoiseOfInputs(noise, inputs, count)
+    check_shape("sensor noise covariance(u)", law.given, (np.ones(len(inputs)),), (count, count))
+    return named, law
+
+
+def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
+    """Return a sensor's function h(x); raise ValueError where it needs more arguments than the state."""
+    checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
+    try:
+        signature = inspect.signature(checked)
+    except ValueError:  # of what is not Python, nothing is known before it is called
+        return checked
+    try:
+        signature.bind(None)
+    except TypeError:
+        expected = "a function of x alone, or inputs=[...], the names of those that a function of (x, u) takes"
+        raise fail("measure of a sensor", expected, f"one of {signature}") from None
+    return checked
+
+
+def require_constant(name: str, value: object) -> Any:
+    """Return a sensor's matrix or noise as it is; raise ValueError for a function, whose inputs have no names."""
+    if callable(value):
+        expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
+        raise fail(name, expected, "a function")
+    return value

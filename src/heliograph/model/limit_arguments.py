@@ -1,0 +1,79 @@
+"""Limits as users give them, read as intervals (low, high): of received numbers, and of a plant's states."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.numerics.check import fail, show_value
+from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.types import Array, Float
+
+StateLimits = tuple[tuple[str, tuple[float, float]], ...]  # of each limited state its name, lowest and highest value
+StateLimitsLike = TypeAliasType("StateLimitsLike", "Mapping[str, Sequence[float | None]] | StateLimits")
+
+
+def read_intervals(limits: object, received: int, name: str = "limits") -> Float[np.ndarray, "m 2"]:
+    """Return (low, high) for each received number, infinite where there is no limit."""
+    everything = [-np.inf, np.inf]
+    if limits is None:
+        return np.tile(everything, (received, 1))
+    expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
+    try:
+        values = np.asarray(limits, dtype=object)
+    except (TypeError, ValueError):
+        raise fail(name, expected, show_value(limits)) from None
+    if values.shape not in ((2,), (received, 2)):
+        raise fail(name, expected, show_value(limits))
+    rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
+    pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
+    intervals = read_numbers(name, pairs, expected)
+    if np.any(~(intervals[:, 0] < intervals[:, 1])):
+        raise fail(name, "a low end below the high one", show_value(limits))
+    return intervals
+
+
+def read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
+    """Return real numbers as an array of doubles, or raise one line."""
+    try:
+        values = np.asarray(value)
+        if values.size and values.dtype.kind not in "fiu":
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        raise fail(name, expected, show_value(value)) from None
+    return values.astype(np.float64)
+
+
+def read_state_limits(
+    limits: StateLimitsLike, states: Sequence[str], circular: Sequence[str], initial_mean: Array
+) -> StateLimits:
+    """Return the limits of a plant's states in their order, infinite where there is none; () for no limits.
+
+    Args:
+        limits: lowest and highest value by state, None where there is no limit.
+        states: names of the states.
+        circular: those that are angles, which have no limits.
+        initial_mean: mean of the state at the start (n,), which must lie within them.
+
+    Raises:
+        ValueError: what is no such table, a name that is no state or an angle, a start that they exclude.
+    """
+    # A table whose keys are states that are no angles.
+    expected = 'a table such as {"soc": (0, 1), "speed": (0, None)}'
+    try:
+        given = dict(limits)
+    except (TypeError, ValueError):
+        raise fail("limits of states", expected, show_value(limits)) from None
+    no_angles = [str(name) for name in states if name not in circular]
+    for name in given:
+        if name not in no_angles:
+            raise fail("limits of states", f"names of states that are no angles, {no_angles}", show_value(name))
+    # Each interval holds the initial mean; infinite ones are left out.
+    read = []
+    for name in (name for name in states if name in given):
+        low, high = read_intervals([given[name]], 1, f"limits of {name!r}")[0].tolist()
+        if not is_traced(initial_mean) and not low <= (mean := float(initial_mean[states.index(name)])) <= high:
+            raise fail(f"limits of {name!r}", f"an initial mean within {low:g} to {high:g}", f"{mean:g}")
+        if np.isfinite([low, high]).any():
+            read.append((str(name), (low, high)))
+    return tuple(read)

@@ -1,0 +1,351 @@
+"""Fusion centre that knows the network: joint moments of the local errors, before any data; and it as a filter."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, corrects, estimates, predicts
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.precomputed_filter import LinearisedStep, LinearStep, linear_step
+from heliograph.fusion.all_reports_fusion import (
+    ReportsBelief,
+    correct_with_reports,
+    estimate_state,
+    make_initial_belief,
+    propagate_errors,
+)
+from heliograph.fusion.cross_covariance import (
+    ErrorMoments,
+    ErrorStep,
+    Motion,
+    SourceFactors,
+    make_error_step,
+    make_initial_errors,
+    propagate_errors_jointly,
+    propagate_factors,
+    propagate_state,
+)
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.fusion.report_link import ReportModel
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise, weakest
+from heliograph.model.over_time import OverTime, at, first, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.simulation.centres.observation_model import SeparateObservations, SharedObservation
+
+
+class CentreState(NamedTuple):
+    """State of a centre: moments of the nodes' errors, and the states of its rules by name of the fusion."""
+
+    errors: ErrorMoments
+    rules: dict[str, PyTree]
+
+
+class FusionCentre(Module):
+    """All informed fusions of one filter's estimates, at the nodes that have it: each step propagates their errors.
+
+    Args:
+        plant: the linear plant that the filters estimate.
+        observation_model: of the nodes' measurements.
+        rules: by name of the fusion.
+        order: brings what is gathered from the sources into the order of the nodes.
+        sources: (kind, number within the kind) of the stacked filters, one group of nodes after another.
+        size: length of the longest measurement, to which others are padded.
+        claim: of the fused estimates.
+    """
+
+    plant: AnyPlant
+    observation_model: SeparateObservations | SharedObservation
+    rules: dict[str, AbstractInformedFusion]
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    compute_matrices = staticmethod(linear_step)
+
+    def init(self, starts: Sequence[jax.Array]) -> CentreState:
+        """Return the state before the first step, from the initial means (node, n) of each source's filters."""
+        plant = at(self.plant, 0)
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
+
+    def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
+        """Return the step of the errors of filters with these matrices, and the errors' moments after it.
+
+        `errors`: moments before step k. `filters`: matrices in the order of the nodes.
+        """
+        step = self.compute_error_maps(errors.state_mean, errors.state_covariance, filters, u, k)
+        return CentreStep(step, propagate_errors_jointly(errors, step))
+
+    def compute_error_maps(
+        self, mean: jax.Array, covariance: jax.Array, filters: LinearStep, u: jax.Array, k: jax.Array
+    ) -> ErrorStep:
+        """Return the linear maps of the errors in step k, for a plant with these moments before it.
+
+        `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
+        """
+        plant: LinearPlant = at(self.plant, k)
+        motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
+        observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
+        return make_error_step(filters, motion, observation)
+
+    def propagate_error_factors(
+        self,
+        start: tuple[PyTree, SourceFactors],
+        compute_matrices: Callable[..., LinearStep],
+        step_filters: Callable[..., PyTree],
+        u: Array,
+    ) -> SourceFactors:
+        """Return the factors of the errors' joint covariance after all steps.
+
+        Args:
+            start: the filters' states and the factors before the first step.
+            compute_matrices: of (states, u, k), the matrices of the filters' step k in the order of the nodes.
+            step_filters: of (states, u, k), the filters' states after step k.
+            u: inputs of the plant (step, inputs), one row for each step.
+        """
+
+        def propagate(
+            carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[PyTree, SourceFactors], None]:
+            """Step the filters' states, and the factors by the filters' matrices."""
+            (states, factors), (k, u_k) = carry, row
+            # Moments of the plant's state: row 0 of the means, and its part of the factors.
+            covariance = jnp.asarray(factors.state @ factors.state.T)
+            matrices = compute_matrices(states, u_k, k)
+            step = self.compute_error_maps(factors.mean[0], covariance, matrices, u_k, k)
+            return (step_filters(states, u_k, k), propagate_factors(factors, step, k)), None
+
+        (_, factors), _ = jax.lax.scan(propagate, start, (jnp.arange(len(u)), jnp.asarray(u)))
+        return factors
+
+    def gather_matrices(self, parts: Sequence[LinearStep]) -> LinearStep:
+        """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement.
+
+        `parts`: those of each source, with a leading axis of nodes.
+        """
+        return join_step_matrices(parts, self.order, self.size)
+
+    def step(
+        self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
+    ) -> tuple[CentreState, dict[str, Estimate]]:
+        """Return the next state, and the fused estimates of step k by name of the fusion.
+
+        Args:
+            state: before the step.
+            parts: matrices of the sources' filters in the step, with a leading axis of nodes.
+            means: of their estimates after it (node, n), by source.
+            u: inputs of the plant over the step.
+            k: number of the step.
+        """
+        happened = self.step_errors(state.errors, self.gather_matrices(parts), u, k)
+        reports = jnp.concatenate(means)[self.order]
+        after, results = {}, {}
+        for name, rule in self.rules.items():
+            after[name], (mean, covariance) = rule.fuse_step(state.rules[name], happened, reports)
+            results[name] = Estimate(mean, covariance, self.claim)
+        return CentreState(happened.errors, after), results
+
+
+# Axes of a filter's matrices that are as long as its measurement, counted from the last.
+MEASURED = {"gain": (-1,), "output": (-2,), "offset": (-1,), "innovation": (-2, -1), "noise": (-2, -1)}
+Matrices = TypeVar("Matrices", LinearStep, LinearisedStep)
+
+
+def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
+    """Return the matrices of several groups of filters, one after another and then in this order.
+
+    Axes as long as the measurement are padded with zeros to `size`.
+    """
+
+    def pad(name: str, leaf: jax.Array) -> jax.Array:
+        """Return the matrix that is the field `name`, with its measurement axes padded to `size`."""
+        padding = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
+                   for axis, length in enumerate(leaf.shape)]  # fmt: skip
+        return jnp.pad(leaf, padding)
+
+    matrices = type(parts[0])
+    joined = {
+        field: jnp.concatenate([pad(field, getattr(part, field)) for part in parts]) for field in matrices._fields
+    }
+    return matrices(**{field: leaf[order] for field, leaf in joined.items()})
+
+
+Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, channel and filter of each node
+
+
+def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+    """Return the claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
+
+    Args:
+        rule: its name, for errors.
+        plant: that all nodes estimate.
+        nodes: sensor, channel and filter of each node.
+        shared: whether the nodes receive parts of one channel.
+
+    Raises:
+        ValueError: naming the knowledge that is missing.
+    """
+    # What a channel remembers would be part of the errors' joint state.
+    for name, (_, channel, _) in nodes.items():
+        if first(channel).remembers:
+            expected = f"fusion by {rule}: node {name!r}"
+            raise fail(expected, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
+    refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
+    if has_data_dependent_gains(nodes):
+        _check_data_dependent_gains(rule, nodes, shared)
+        return "nominal"
+    _check_linear_and_planned(rule, plant, nodes)
+    known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
+    return lower_claim_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
+
+
+def has_data_dependent_gains(nodes: Parts) -> bool:
+    """Return whether some filter's gains depend on data, so that errors can only be propagated along the estimates."""
+    return any(isinstance(filter, GaussianFilter) and not filter.linear for _, _, filter in nodes.values())
+
+
+def _check_data_dependent_gains(rule: str, nodes: Parts, shared: bool) -> None:
+    """Raise unless all filters are cubature or extended ones, of nodes that share nothing but the plant."""
+    for name, (_, _, filter) in nodes.items():
+        if not isinstance(filter, GaussianFilter) or filter.linear:
+            raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", filter)
+    if shared:
+        raise fail(f"fusion by {rule}", "nodes that share nothing but the plant, or filters whose gains depend on no "
+                   "data", "nodes that share a channel")  # fmt: skip
+
+
+def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
+    """Raise unless plant and sensors are linear, and the gains of all filters depend on no data."""
+    if not isinstance(first(plant), LinearPlant):
+        raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
+    for name, (sensor, _, filter) in nodes.items():
+        where = f"fusion by {rule}: node {name!r}"
+        if not isinstance(first(sensor), LinearSensor):
+            raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
+        if not filter.is_linear:
+            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
+
+
+def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
+    """Return the claim of fusion by reports: that of the fusion, lowered by quantizers and uplinks of uncertain laws.
+
+    `complete`: for each node whether it loses no measurement.
+
+    Raises:
+        ValueError: nodes that lose measurements, which the centre cannot know from a missing report.
+    """
+    lossy = [name for name, receives_all in complete.items() if not receives_all]
+    if lossy:
+        raise fail(f"fusion by {rule} of reports", "nodes that lose no measurements, of which the centre would have "
+                   "to know", f"losses at {lossy}")  # fmt: skip
+    names = list(complete)
+    channels = [link.channel for link in fusion.links(names) if link.channel is not None]
+    for quantizer in fusion.quantizers(names):
+        claim = quantizer.claim(claim)
+    return weakest([claim, "nominal"]) if any(map(_has_uncertain_law, channels)) else claim
+
+
+def _has_uncertain_law(channel: Channel) -> bool:
+    """Return whether probabilities of the channel's laws are known up to a radius only."""
+    try:
+        return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))
+    except ValueError:  # too many corners to list
+        return True
+
+
+class NodeFiltersWithoutData(Protocol):
+    """The nodes' filters as their centre steps them: without data, on which their gains do not depend."""
+
+    @property
+    def linear_centres(self) -> tuple[FusionCentre, ...]:
+        """The centre of their errors' moments, alone."""
+
+    def init(self) -> PyTree:
+        """Return the states before the first step."""
+
+    def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> Sequence[PyTree]:
+        """Return the matrices of the filters' step k for each source of the centre, from their states before it."""
+
+    def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """Return the filters' states after step k."""
+
+
+class CentreFilterState(NamedTuple):
+    """What the centre knows after a step.
+
+    Args:
+        nodes: states of the nodes' filters, of which only covariances matter.
+        errors: moments of their errors.
+        known: joint estimate of the plant's state, the errors and the reports that may still arrive.
+    """
+
+    nodes: PyTree
+    errors: ErrorMoments
+    known: ReportsBelief
+
+
+class CentreFilter(AbstractSizedFilter):
+    """Filter form of `AllReports`, whose measurement is the reports: for streams, recordings and simulated runs.
+
+    The measurement is, for each age in steps and each node in turn, the report that arrived, NaN where none did.
+
+    Args:
+        filters: of the nodes, propagated without data: their gains depend on none.
+        links: model of the uplinks, by which the reports come.
+        rows: which of all (age, node, component), flattened, can arrive.
+        ages: how many ages in steps a report can have, 0 included.
+        widest: components of the longest report.
+        quantized: whether reports are quantized.
+    """
+
+    filters: NodeFiltersWithoutData
+    links: ReportModel | OverTime
+    rows: tuple[int, ...] = eqx.field(static=True)
+    ages: int = eqx.field(static=True)
+    widest: int = eqx.field(static=True)
+    quantized: bool = eqx.field(static=True)
+
+    @compile_in_float64
+    def init(self) -> CentreFilterState:
+        """Return the state before any report."""
+        states, _, _, known, *_ = self.filters.init()
+        errors = known[0].errors
+        return CentreFilterState(
+            states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
+        )
+
+    @predicts
+    def predict(self, state: CentreFilterState, u: ArrayLike = (), k: Step = 0) -> CentreFilterState:
+        """Predict plant and all errors; the nodes send their reports."""
+        (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
+        filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
+        happened = centre.step_errors(state.errors, filters, u, step)
+        following = self.filters.step_without_data(state.nodes, u, step)
+        return CentreFilterState(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
+
+    @corrects
+    def correct(self, state: CentreFilterState, z: ArrayLike, k: Step = 0) -> tuple[CentreFilterState, Innovation]:
+        """Correct with the reports that arrived, z of `rows`, NaN where one did not; return the innovation too."""
+        nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
+        reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
+        known, expected = correct_with_reports(state.known, reports.reshape(self.ages, nodes, self.widest))
+        mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
+        return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
+
+    @estimates
+    def estimate(self, state: CentreFilterState) -> Estimate:
+        """Return the best linear estimate of the plant's state."""
+        return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

@@ -1,0 +1,153 @@
+"""Fusion centre of nonlinear filters: cross-covariances of their errors, linearised along the centre's estimate."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.linear.precomputed_filter import LinearisedStep, linearise_step
+from heliograph.fusion.all_reports_fusion import AllReports, ReportsBelief
+from heliograph.fusion.cross_covariance import (
+    ErrorMap,
+    ErrorMoments,
+    ErrorStep,
+    Motion,
+    make_initial_errors,
+    propagate_errors_jointly,
+)
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion, CentreStep
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at
+from heliograph.model.plant import AnyPlant
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.fusion_centre import join_step_matrices
+
+
+class LinearisedFusionState(NamedTuple):
+    """State of one fusion: moments of the nodes' errors, its last estimate `known` (n,), and its rule's state."""
+
+    errors: ErrorMoments
+    known: jax.Array
+    rule: PyTree
+
+
+class LinearisedCentre(Module):
+    """A `FusionCentre` of filters whose gains depend on data; its claim is nominal, as theirs are.
+
+    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i C_i: K_i and C_i are derivatives of each filter's
+    step, S_ij = 0, and S_ii is the innovation covariance less C_i P_i C_i'. A is common, the plant's derivative at the
+    fusion's last estimate: with each filter's A, nodes that share an error would seem to differ by their linearisations
+    alone, and weights of such differences claim information that is not there.
+
+    Fields as of `FusionCentre`: `sources` are the stacked filters, `order` the nodes' order in what is gathered from
+    them, `size` the length of the longest measurement.
+    """
+
+    plant: AnyPlant
+    rules: dict[str, AbstractInformedFusion]
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    compute_matrices = staticmethod(linearise_step)
+
+    def init(self, starts: Sequence[jax.Array]) -> dict[str, LinearisedFusionState]:
+        """Return the states of all fusions before the first step, by name.
+
+        `starts`: initial means (node, n) of each source's filters.
+        """
+        plant = at(self.plant, 0)
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        mean = jnp.asarray(plant.initial_mean)
+        return {name: LinearisedFusionState(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
+
+    def step(
+        self,
+        state: dict[str, LinearisedFusionState],
+        parts: Sequence[LinearisedStep],
+        means: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+    ) -> tuple[dict[str, LinearisedFusionState], dict[str, Estimate]]:
+        """Return the next state and the fused estimates of step k, both by name of the fusion.
+
+        Args:
+            state: before the step.
+            parts: derivatives of the sources' filters in the step, with a leading axis of nodes.
+            means: of their estimates after it (node, n), by source.
+            u: inputs of the plant over the step.
+            k: number of the step.
+        """
+        linear, reports = join_step_matrices(parts, self.order, self.size), jnp.concatenate(means)[self.order]
+        plant = at(self.plant, k)
+        # F_i = I - K_i C_i of all nodes (node, n, n).
+        keep = jnp.eye(reports.shape[-1]) - linear.gain @ linear.output
+        following, results = {}, {}
+        for name, rule in self.rules.items():
+            before = state[name]
+            # x+ = A x + b + w, linearised for all nodes at the fusion's last estimate.
+            matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
+            moved = plant.transition(before.known, u) + plant.noise_mean()
+            motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
+            # Moments of the errors, by which the rule weights the reports.
+            step = _make_joint_error_step(motion, keep, linear)
+            errors = _replace_plant_moments(before.errors, propagate_errors_jointly(before.errors, step))
+            # `AllReports` estimates the errors themselves, so that their means matter too.
+            if isinstance(rule, AllReports):
+                drift = _compute_drift_of_mean_errors(before.rule, matrix, moved, keep, linear)
+                step = step._replace(shift=jnp.concatenate([motion.shift, drift.reshape(-1)]))
+            rule_state, (mean, covariance) = rule.fuse_step(before.rule, CentreStep(step, errors), reports)
+            following[name] = LinearisedFusionState(errors, known=mean, rule=rule_state)
+            results[name] = Estimate(mean, covariance, self.claim)
+        return following, results
+
+
+def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
+    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
+
+    The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
+    """
+    nodes, n, _ = keep.shape
+    return ErrorStep(
+        transition=ErrorMap(motion.matrix, jnp.zeros_like(keep), keep @ motion.matrix),
+        shift=jnp.pad(motion.shift, (0, nodes * n)),
+        of_noise=jnp.concatenate([jnp.eye(n), keep.reshape(nodes * n, n)]),
+        process=motion.noise,
+        gain=linear.gain,
+        received=linear.noise,
+    )
+
+
+def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
+    """Return the moments of the errors `after` a step with those of the plant `before` it.
+
+    Along estimates nobody knows the plant's own moments: its mean stays, and its covariance with all else.
+    """
+    n = before.mean.shape[1]
+    of_errors = np.arange(len(before.covariance)) >= n
+    covariance = jnp.where(np.outer(of_errors, of_errors), after.covariance, before.covariance)
+    return ErrorMoments(jnp.concatenate([before.mean[:1], after.bias]), covariance)
+
+
+def _compute_drift_of_mean_errors(
+    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised
+) -> jax.Array:
+    """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
+
+    Each filter's prediction m_i- is known, so that E e_i- = E x- - m_i-.
+
+    Args:
+        state: the rule's, with the means E e_i before the step.
+        matrix: A (n, n).
+        moved: E x- (n,).
+        keep: F_i of all nodes (node, n, n).
+        linear: with the filters' predictions m_i- (node, n).
+    """
+    nodes, n, _ = keep.shape
+    before = state.gaussian.mean[n:].reshape(nodes, n)
+    return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)

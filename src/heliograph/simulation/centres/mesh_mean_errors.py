@@ -1,0 +1,234 @@
+"""Errors of nodes that estimate from their neighbours, in the mean over independent losses, before any data.
+
+In a step the errors become e_i+ = M_i e + F_i w - sum_l K_il v_l: e the errors of all nodes, of joint covariance J; w
+the plant's noise, of covariance Q; v_l the noise of node l's measurement, of covariance R_l. What arrives at node i
+decides its M_i, F_i and K_il. Where these depend on what arrives at this step alone, J is independent of them, and
+losses of different receivers of each other. For i != j
+
+  J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'
+
+and the diagonal blocks are means over all patterns of what may arrive at one node. N = nodes n.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.mesh.graph import graph_of
+from heliograph.fusion.mesh.joint_error_covariance import (
+    blocks_of,
+    error_transitions,
+    measurement_weights,
+    propagate_joint_covariance,
+    scatter_blocks,
+)
+from heliograph.fusion.mesh.neighbour_rules import FrozenWeights
+from heliograph.fusion.mesh.node_gains import NodeGains
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.fusion.rules import AbstractFusion
+from heliograph.linear.jump_system import propagate_by_mode
+from heliograph.model.channel import Channel
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.arguments import read_plant_inputs
+from heliograph.simulation.centres.mesh import Mesh
+from heliograph.simulation.centres.mesh_check import find_claim_of_errors
+from heliograph.simulation.centres.mesh_errors import MeshErrors, compute_full_step, find_mesh
+from heliograph.simulation.centres.mesh_state_and_step import MeshStep, NodeBucket
+from heliograph.simulation.centres.neighbour_edges import find_arrival_probability, links_by_edge
+from heliograph.simulation.network import Network
+
+NODES, DEGREE = 200, 10  # most nodes and neighbours of one node whose patterns are listed: 2^degree rows a node
+
+
+class ArrivalPatterns(NamedTuple):
+    """All patterns of what may arrive at each node, one row each, node after node.
+
+    Args:
+        node: number of the node (row,).
+        present: which of its messages arrive (row, degree), its own first.
+        probability: of the pattern (row,).
+        start: first row of each node (node,).
+    """
+
+    node: np.ndarray
+    present: np.ndarray
+    probability: np.ndarray
+    start: np.ndarray
+
+
+def mean_mesh_errors(
+    network: Network, fusion: str, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
+) -> MeshErrors:
+    """Compute the covariances of all nodes' errors in the mean over losses, for weights made from this mean.
+
+    A node then needs nothing but what arrives at this step: best weights are solved for it, from the mean joint
+    covariance of its neighbourhood. Up to 200 nodes of at most 10 neighbours, losses independent over steps and edges.
+
+    Args:
+        network: the network.
+        fusion: name of its fusion between neighbours, by best weights or diffusion.
+        horizon: number of steps.
+        inputs: inputs of the plant (horizon, inputs); by default a plant without inputs is assumed.
+
+    Raises:
+        ValueError: no such fusion, a rule whose gains remember losses (intersection), losses in bursts, too many
+            neighbours.
+    """
+    # J may be averaged over losses only where gains depend on what arrives at this step alone, not on earlier losses.
+    mesh = find_mesh(network, fusion)
+    between = network.meshes[fusion]
+    if not (between.rule.needs_joint or isinstance(between.rule, FrozenWeights)):
+        expected = "best weights or diffusion (an intersection remembers losses: mesh_errors of drawn arrivals)"
+        raise fail(f"mean errors of fusion {fusion!r}", expected, type(between.rule).__name__)
+    network.check_horizon(check_count("horizon", horizon))
+    u = read_plant_inputs(network, inputs, horizon)
+    patterns, rows = _list_patterns(mesh, between)
+    with jax.enable_x64(True):
+        start = to_numpy(mesh.init())
+    # J_k -> J_k+1: gains of every pattern from J_k, then means over the patterns. Before any data all nodes have the
+    # same error, x_0 - E x_0.
+    count, n = start.mean.shape
+    covariance, moments = start.covariance, start.plant
+    _, initial_covariance = start.plant
+    joint = np.tile(initial_covariance, (count, count))
+    errors = []
+    for k, u_k in enumerate(u):
+        with jax.enable_x64(True):
+            step = to_numpy(compute_full_step(mesh, start.covariance, moments, u_k, np.asarray(k)))
+            blocks = np.asarray(blocks_of(joint.reshape(count, n, count, n), mesh.senders))
+            gains = to_numpy(_compute_gains_by_pattern(rows, covariance, blocks, patterns, step))
+        joint, moments = _average_joint(mesh, joint, blocks, patterns, gains, step), step.plant
+        errors.append(np.einsum("iaib->iab", joint.reshape(count, n, count, n)).copy())
+        # The first pattern of each node stands for all: only diffusion reads this covariance, and by diffusion it is
+        # the same in every pattern of a node.
+        covariance = np.asarray(gains.covariance)[patterns.start]
+    return MeshErrors(
+        nodes=mesh.nodes,
+        actual=np.stack(errors),
+        claimed=np.stack(errors),
+        joint=joint.reshape(count, n, count, n),
+        claim=find_claim_of_errors(fusion, between, network),
+    )
+
+
+def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
+    """Return all patterns of what may arrive in a step of this fusion, and the mesh with a row for each of them."""
+    graph = graph_of(fusion.neighbours or {}, mesh.nodes)
+    links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
+    chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
+    patterns = _compute_pattern_probabilities(mesh, np.array(chances))
+    return patterns, _repeat_nodes_by_pattern(mesh, fusion.rule.placed(graph), patterns)
+
+
+def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
+    """Return the mesh with a row for each pattern of each node in place of one for each node.
+
+    `rule`: placed on the nodes, which are the last axis of its arrays.
+    """
+    rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
+    bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
+    repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
+    return repeated
+
+
+@quickly_compiled
+def _compute_gains_by_pattern(
+    rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
+) -> NodeGains:
+    """Return the gains of each pattern, with a leading axis of patterns: weights for what arrives in it.
+
+    Args:
+        rows: the mesh, with a row for each pattern.
+        covariance: by which the nodes' estimates are weighed before the step (node, n, n).
+        blocks: of J at each neighbourhood (node, degree, n, degree, n).
+        patterns: what arrives.
+        step: at which everything arrives, for the models and the measurements' information.
+    """
+    information = rows.sum_over_messages(jnp.asarray(step.data.information), jnp.asarray(patterns.present))
+    complete = jnp.asarray(step.information)[patterns.node]
+    blocks_by_pattern = jnp.asarray(blocks)[patterns.node]
+    return rows.compute_gains(jnp.asarray(covariance), blocks_by_pattern, jnp.asarray(patterns.present), step.motion,
+                      information, complete)  # fmt: skip
+
+
+def _average_joint(
+    mesh: Mesh, joint: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, gains: NodeGains, step: MeshStep
+) -> np.ndarray:
+    """Return J+ (N, N): of two nodes by products of mean gains, of one node by the mean over its patterns.
+
+    Args:
+        mesh: the fusion between neighbours.
+        joint: J (N, N).
+        blocks: of J at each neighbourhood (node, degree, n, degree, n).
+        patterns: what may arrive.
+        gains: of each pattern.
+        step: the plant over the step, and the measurements' information S_l = H_l' R_l^-1 H_l.
+    """
+    count, degree = mesh.senders.shape
+    q, s, n = np.asarray(step.motion.noise), np.asarray(step.data.information), len(step.motion.shift)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        """Return E[value] of each node (node, ...), sum_r p_r value_r over its patterns r, from `values` (row, ...)."""
+        weighted = values * patterns.probability.reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(np.add.reduceat(weighted, patterns.start, axis=0))
+
+    # Of every pattern r: M_r (the node itself first), F_r, and the weights W_rl of H_l' R_l^-1 z_l for what arrived, so
+    # that K_rl = W_rl H_l' R_l^-1 and K_rl R_l K_rl' = W_rl S_l W_rl'.
+    m, f = np.asarray(error_transitions(gains, step.motion.matrix)), np.asarray(gains.innovation)
+    w = np.asarray(measurement_weights(gains.gain, patterns.present))
+    # i != j: J_ij+ = E[M_i] J E[M_j]' + E[F_i] Q E[F_j]' + sum_l E[K_il] R_l E[K_jl]'.
+    mean_w = mean(w)
+    sparse_m, sparse_ws, sparse_w = (  # matrices (N, N) of all nodes
+        scatter_blocks(x, mesh.senders, mesh.edges.present) for x in (mean(m), mean_w @ s[mesh.senders], mean_w)
+    )
+    after = propagate_joint_covariance(joint, sparse_m, mean(f), q, sparse_ws, sparse_w)
+    # i = j: J_ii+ = E[M_r J M_r' + F_r Q F_r' + sum_l K_rl R_l K_rl'], with J of the neighbourhood of i.
+    flat = m.swapaxes(1, 2).reshape(len(m), n, degree * n)  # M_r as one matrix
+    inside = blocks.reshape(count, degree * n, degree * n)[patterns.node]
+    noise = np.einsum("rdab,rdbc,rdec->rae", w, s[mesh.senders][patterns.node], w)  # sum_l W_rl S_l W_rl'
+    diagonal = mean(propagate_by_mode(flat, inside, propagate_by_mode(f, q, noise)))
+    blocks_after = after.reshape(count, n, count, n)  # a view: writing here changes `after`
+    nodes = np.arange(count)
+    blocks_after[nodes, :, nodes, :] = diagonal
+    return np.asarray(after)
+
+
+def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPatterns:
+    """Return all patterns of what may arrive at every node, with their probabilities.
+
+    P(pattern) = prod_j p_ij over the edges j to i that deliver, and 1 - p_ij over those that do not.
+    `chances`: p of every edge, receiver after receiver.
+    """
+    counts = mesh.edges.present[:, 1:].sum(axis=1)
+    if len(counts) > NODES or counts.max() > DEGREE:
+        raise fail("mean errors between neighbours", f"at most {NODES} nodes of at most {DEGREE} neighbours",
+                   f"{len(counts)} nodes of up to {counts.max()}")  # fmt: skip
+    rows: list[int] = []
+    present: list[list[bool]] = []
+    probability: list[float] = []
+    start: list[int] = []
+    for i, of_node in enumerate(np.split(chances, np.cumsum(counts)[:-1])):
+        start.append(len(rows))
+        # What arrives for certain is not varied.
+        for flags in product(*[[True] if p == 1 else [True, False] for p in of_node]):
+            rows.append(i)
+            present.append([True, *flags, *[False] * (mesh.senders.shape[1] - 1 - len(flags))])
+            probability.append(float(np.prod(np.where(flags, of_node, 1 - of_node))))
+    return ArrivalPatterns(
+        node=np.array(rows), present=np.array(present), probability=np.array(probability), start=np.array(start)
+    )
+
+
+def _get_known_probability(edge: str, link: Channel) -> float:
+    """Return the probability that a message of this edge arrives, at every step the same and drawn anew."""
+    chance = find_arrival_probability(link)
+    if chance is None:
+        expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"
+        raise fail(f"mean errors: link {edge!r}", expected, type(link).__name__)
+    return chance

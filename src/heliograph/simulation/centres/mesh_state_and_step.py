@@ -1,0 +1,187 @@
+"""Fusion between neighbours: its state, what a step computes without the estimates, and the formulas of a step.
+
+`n`: number of the plant's states; `m`: of the longest measurement; `degree`: most messages that a node receives, its
+own counted first.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.cross_covariance import JointObservation, Motion
+from heliograph.fusion.mesh.joint_error_covariance import (
+    error_transitions,
+    measurement_weights,
+    propagate_joint_covariance,
+    scatter_blocks,
+)
+from heliograph.fusion.mesh.node_gains import NeighbourEstimates, NeighbourWeights, NodeGains, information_of
+from heliograph.fusion.rules import AbstractFusion
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, Bool, Float
+from heliograph.simulation.centres.late_and_quantized_messages import MessagesOnTheWay
+
+# Which messages arrive, each node's from itself first; where they may be late, their ages in steps, -1 of none.
+Arrived = Bool[Array, "node rounds degree"]
+# Weights computed before a step: for each bucket of nodes the parts and the covariance of `NeighbourWeights`, a row for
+# each node of the bucket; empty where none are.
+Ahead = Sequence[Sequence[Array]]
+
+
+class NodeBucket(Module):
+    """Nodes of a mesh that have about as many neighbours, and the rule placed on them.
+
+    Args:
+        rule: by which each of them weighs what it receives, with arrays whose last axis is the node.
+        rows: numbers of these nodes in the mesh.
+        width: the most messages that one of them receives, its own included.
+    """
+
+    rule: AbstractFusion
+    rows: np.ndarray
+    width: int = eqx.field(static=True)
+
+
+class MeshState(NamedTuple):
+    """Estimates of all nodes, the covariances by which they weigh, and what is known before any data.
+
+    Args:
+        mean: estimates of the nodes (node, n).
+        covariance: by which rules weigh them (node, n, n).
+        joint: covariance of all nodes' errors (node, n, node, n); None where the rule does without.
+        plant: mean (n,) and covariance (n, n) of the plant's state before any data.
+        sent: estimates that each node received last of its neighbours (node, degree, n), predicted to the present step;
+            None where every estimate is sent at every step.
+        way: messages that may still arrive later; None where none is late or quantized.
+    """
+
+    mean: Float[jax.Array, "node n"]
+    covariance: Float[jax.Array, "node n n"]
+    joint: Float[jax.Array, "node n node n"] | None
+    plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+    sent: Float[jax.Array, "node degree n"] | None
+    way: MessagesOnTheWay | None
+
+
+class MeasurementInformation(NamedTuple):
+    """Information in the measurements of one step, z_j = H_j x + offset_j + noise of covariance R_j, by node j.
+
+    Args:
+        observation: H_j, offset_j and R_j of all nodes.
+        weighted: H_j' R_j^-1 (node, n, m) of the components that are not missing.
+        information: S_j = H_j' R_j^-1 H_j (node, n, n) of the components that are not missing.
+        complete: S_j (node, n, n) as if no component were missing.
+    """
+
+    observation: JointObservation
+    weighted: Float[jax.Array, "node n m"]
+    information: Float[jax.Array, "node n n"]
+    complete: Float[jax.Array, "node n n"]
+
+
+class MeshStep(NamedTuple):
+    """All of one step of all nodes that does not depend on the estimates.
+
+    Args:
+        motion: the plant over the step.
+        plant: mean (n,) and covariance (n, n) of the plant's state after the step, before any data.
+        exchanges: weights in every round of exchange but the last, with a leading axis of nodes.
+        data: information in the step's measurements, by the node that took them.
+        information: sum of S_j over the measurements that reach each node (node, n, n).
+        gains: of fusing, predicting and correcting, with a leading axis of nodes.
+    """
+
+    motion: Motion
+    plant: tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]
+    exchanges: tuple[NeighbourWeights, ...]
+    data: MeasurementInformation
+    information: Float[jax.Array, "node n n"]
+    gains: NodeGains
+
+
+def compute_information(observation: JointObservation, measured: Bool[jax.Array, "node m"]) -> MeasurementInformation:
+    """Return the information in each node's measurement: in the components measured, and as if none were missing."""
+    # Rows of zeros without noise only pad a measurement.
+    real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
+    gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
+    weighted, information = jax.vmap(information_of)(gain, noise, real & measured)
+    _, complete = jax.vmap(information_of)(gain, noise, real)
+    return MeasurementInformation(observation, weighted, information, complete)
+
+
+def weigh_measurements(
+    data: MeasurementInformation,
+    measured: Float[jax.Array, "node m"],
+    present: Bool[jax.Array, "node m"],
+    common: Float[jax.Array, " n"],
+) -> Float[jax.Array, "node n"]:
+    """Return H_j' R_j^-1 (z_j - offset_j - H_j m) of each node's measurement, m = `common`; what is missing adds 0."""
+    observation = data.observation
+    off = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
+    return jnp.einsum("inm,im->in", data.weighted, off)
+
+
+def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEstimates:
+    """Return what nodes received, with covariances that hold where neighbours send on events alone.
+
+    What a neighbour sent last errs by more than its estimate of covariance P: by (1 + sqrt(alpha n))^2 P at most, see
+    `find_event_senders`. A node's own estimate, the first, is as it is.
+
+    Args:
+        received: estimates, with a leading axis of nodes.
+        alpha: threshold of the events.
+    """
+    degree, n = received.information.shape[1:3]
+    factor = jnp.where(np.arange(degree) > 0, (1 + jnp.sqrt(alpha * n)) ** 2, 1.0)
+    return received._replace(traces=received.traces * factor, information=received.information / factor[:, None, None])
+
+
+def pull_to_neighbours(
+    front: Float[jax.Array, "node n n"],
+    parts: Float[jax.Array, "node degree n *n"],
+    mean: Float[jax.Array, "node n"],
+    received: Float[jax.Array, "node degree n"],
+) -> Float[jax.Array, "node n"]:
+    """Return front_i sum_j parts_ij (received_ij - mean_i) over the neighbours j of each node i.
+
+    Args:
+        front: a matrix for each node.
+        parts: a matrix for each message, or its diagonal alone.
+        mean: the nodes' own estimates.
+        received: the estimates that each node received, in place 0 its own, which adds nothing.
+    """
+    difference = (received - mean[:, None]).at[:, 0].set(0.0)
+    is_matrix = parts.ndim == 4
+    pull = jnp.einsum("idab,idb->ia", parts, difference) if is_matrix else jnp.sum(parts * difference, axis=1)
+    return jnp.einsum("iab,ib->ia", front, pull)
+
+
+def propagate_joint(
+    joint: Float[jax.Array, "node n node n"],
+    step: MeshStep,
+    arrived: Bool[Array, "node degree"],
+    senders: np.ndarray,
+    present: np.ndarray,
+) -> Float[jax.Array, "node n node n"]:
+    """Return the joint covariance M J M' + F Q F' + sum_l K_l R_l K_l' of all nodes' errors after a step, from J.
+
+    F is `step.gains.innovation`. Node i adds W_il H_l' R_l^-1 z_l of node l's measurement, so that
+    K_l = W_l H_l' R_l^-1 and K_l R_l K_l' = W_l S_l W_l'.
+
+    Args:
+        joint: J before the step.
+        step: the plant over it, its gains and its measurements' information.
+        arrived: which messages arrive.
+        senders: of whom each node receives (node, degree).
+        present: where it has a neighbour (node, degree); the other places only pad.
+    """
+    gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
+    weights = measurement_weights(gains.gain, jnp.asarray(arrived))
+    blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights
+    m, ws, w = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
+    after = propagate_joint_covariance(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
+    return jnp.asarray(after).reshape(joint.shape)

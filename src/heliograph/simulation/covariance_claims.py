@@ -1,0 +1,252 @@
+"""Claims (exact, upper, nominal) of a network's covariances: a filter's own where its model is the world, else nominal.
+
+A premise is the world that a filter was made for, or in which it stands: plant, sensor, channel and so on.
+"""
+
+from collections.abc import Iterator, Mapping
+from copy import copy
+from typing import NamedTuple
+
+import jax
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.scheduled_gains import ScheduledFilter
+from heliograph.fusion.joint_covariance_fusion import AbstractInformedFusion
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.model.estimate import Claim
+from heliograph.model.premises.agreement import RANGE, join_premises, list_differences, restrict_premise_to_rows
+from heliograph.model.premises.premise import Premise, StaticPremise
+from heliograph.numerics.check import fail
+from heliograph.simulation.centres.fusion_centre import (
+    find_claim_of_informed_fusion,
+    find_claim_of_report_fusion,
+    has_data_dependent_gains,
+)
+from heliograph.simulation.centres.mesh_check import find_claim_of_mesh
+from heliograph.simulation.node import FUSED, HasNodes, Node, ReceivingNode
+
+UNSAID = "something that it does not say"
+
+
+class MistakenBelief(NamedTuple):
+    """A filter of a network, and the parts of its model that differ from the world at its node.
+
+    Args:
+        node: name of the node; `FUSED` for a filter of all measurements.
+        filter: its name.
+        parts: the parts of the model in which it believes another world, such as "sensor".
+        lowered: whether it would claim more than "nominal" in the world that it believes.
+    """
+
+    node: str
+    filter: str
+    parts: tuple[str, ...]
+    lowered: bool
+
+    @property
+    def another(self) -> str:
+        """What it believes, in words: "another sensor and channel"."""
+        return UNSAID if self.parts == (UNSAID,) else f"another {' and '.join(self.parts)}"
+
+    @property
+    def words(self) -> str:
+        """The same as a sentence: "filter 'f' believes another channel than node 'a'"."""
+        place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
+        reason = ", where limits refuse some" if RANGE in self.parts else ""
+        preposition = "at" if self.parts == (UNSAID,) else "than"
+        return f"filter {self.filter!r} believes {self.another} {preposition} {place}{reason}"
+
+
+def lower_claim(claim: Claim) -> Claim:
+    """Return "nominal" for any claim of a covariance, "none" for none."""
+    return "none" if claim == "none" else "nominal"
+
+
+def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
+    """Return a copy of the filter, and of those inside it, that claims "nominal" at most, and keeps what it claimed."""
+
+    def is_inner(leaf: object) -> bool:
+        """Return whether this is a filter inside the filter."""
+        return leaf is not filter and isinstance(leaf, AbstractFilter)
+
+    leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
+    inner = [lower_to_nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
+    twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
+    object.__setattr__(twin, "claim", lower_claim(filter.claim))
+    object.__setattr__(twin, "kept", StaticPremise(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
+    return twin
+
+
+def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFilter:
+    """Return the filter with its claim if it believes the world where it stands, else lowered to nominal.
+
+    Args:
+        own: the world at the place where it stands: plant, sensor, channel and trigger.
+        filter: the filter, which keeps its claim outside of the network.
+    """
+    is_weak = lower_claim(filter.claim) == filter.claim
+    return filter if is_weak or not list_mistaken_parts(own, filter) else lower_to_nominal(filter)
+
+
+def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes, with each filter lowered to nominal that believes another world than its node's."""
+    results = dict(network.nodes)
+    for name, node in network.nodes.items():
+        if node.filters:
+            own = find_premise(network, name)
+            results[name] = _replace_filters(
+                node, {f: lower_claim_if_mistaken(own, filter) for f, filter in node.filters.items()}
+            )
+    return results
+
+
+def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
+    every = [filter for node in nodes.values() for filter in node.filters.values()]
+    return {
+        name: _replace_filters(
+            node, {f: filter.with_room_for_heartbeats_of(every) for f, filter in node.filters.items()}
+        )
+        for name, node in nodes.items()
+    }
+
+
+def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+    """Return the fusions, with each filter of all measurements lowered to nominal that believes another world."""
+    if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
+        return network.fused
+    own = find_common_premise(network)
+    return {
+        name: lower_claim_if_mistaken(own, f) if isinstance(f, AbstractFilter) else f
+        for name, f in network.fused.items()
+    }
+
+
+def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
+    """Return the nodes with filters that claim "nominal" at most."""
+    return {
+        name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
+        for name, node in network.nodes.items()
+    }
+
+
+def make_fusions_nominal(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
+    """Return the fusions, with filters that claim "nominal" at most."""
+    return {name: lower_to_nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+
+
+def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
+    """Return the node with other filters of the same names; itself where they are its own."""
+    if all(filters[name] is node.filters[name] for name in filters):
+        return node
+    twin = copy(node)
+    object.__setattr__(twin, "filters", filters)
+    return twin
+
+
+def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
+    """Return the parts of the model in which a filter believes another world than that of its place, `own`."""
+    return (UNSAID,) if filter.premise is None else list_differences(filter.premise, own)
+
+
+def find_premise(network: HasNodes, name: str) -> Premise:
+    """Return the world at a node: plant, sensor, channel and trigger, and its limits where they refuse values.
+
+    In a network of relays: plant, the relays, and the gains that they run.
+    """
+    node, plant = network.nodes[name], network.plant
+    if isinstance(node, Node):
+        # Limits without bounds refuse nothing but codes, which tell nothing of the state.
+        limits = node.limits if node.limits is not None and node.limits.bounded else None
+        return Premise(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
+    if network.common is not None:
+        return restrict_premise_to_rows(
+            Premise(plant, network.common.sensor, network.common.channel), network.rows[name]
+        )
+    if network.relays is None:  # a node without a sensor
+        return Premise(plant)
+    # Gains of the relays, each of which runs a single filter by a schedule.
+    schedules = {
+        relay: filter
+        for relay in network.relays.relays
+        if relay in network.nodes
+        for filter in network.nodes[relay].filters.values()
+    }
+    gains = {relay: f.gains.values.gain for relay, f in schedules.items() if isinstance(f, ScheduledFilter)}
+    return Premise(plant, relays=network.relays, gains=gains)
+
+
+def find_common_premise(network: HasNodes) -> Premise:
+    """Return plant, sensors and channels of all nodes together, in their order."""
+    if network.common is not None:
+        return Premise(network.plant, network.common.sensor, network.common.channel)
+    nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
+    return join_premises([find_premise(network, name) for name in nodes]) if nodes else Premise(network.plant)
+
+
+def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
+    """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
+
+    Args:
+        network: the network.
+    """
+    for name in network.names:
+        if filters := network.nodes[name].filters:
+            yield from _yield_mistaken_beliefs(name, find_premise(network, name), filters)
+    central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+    if central:
+        yield from _yield_mistaken_beliefs(FUSED, find_common_premise(network), central)
+
+
+def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[MistakenBelief]:
+    """Yield the filters of a node that claim something and were made for another world than its `own`."""
+    for label, filter in filters.items():
+        says = filter.premise is not None or filter.kept.lowered
+        if filter.claim != "none" and says and (parts := list_mistaken_parts(own, filter)):
+            yield MistakenBelief(node, label, parts, filter.kept.lowered)
+
+
+def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
+    """Return the claim of each estimate of a network, by (node, name); those of the centre last, under FUSED."""
+    claims = {(name, f): filter.claim for name, node in network.nodes.items() for f, filter in node.filters.items()}
+    for name, mesh in network.meshes.items():
+        claims |= dict.fromkeys(
+            ((node, name) for node in network.mesh_nodes(name)), find_claim_of_mesh(name, mesh, network)
+        )
+    # Where data decide what arrives, no fusion can claim more than "nominal".
+    by_data = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
+    for name, fusion in network.fused.items():
+        claim = _find_claim_of_fusion(network, fusion)
+        claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
+    return claims
+
+
+def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) -> Claim:
+    """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
+
+    Raises:
+        ValueError: an informed rule that lacks what it has to know.
+    """
+    if isinstance(fusion, AbstractFilter):
+        return fusion.claim
+    names = network.nodes_with(fusion.filter)
+    # A rule that needs nothing but the estimates.
+    if not isinstance(fusion.rule, AbstractInformedFusion):
+        return fusion.claim([network.nodes[n].filters[fusion.filter].claim for n in names])
+    # An informed rule: it needs the joint moments of the errors, and so all links between them and itself.
+    rule = type(fusion.rule).__name__
+    if fusion.quantizer is not None and not fusion.by_report:
+        raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
+    parts = network.parts_of(fusion.filter)  # of each node that has a sensor: sensor, channel, filter
+    if len(parts) < len(names):
+        raise fail(f"fusion by {rule}", "nodes that receive sensors through channels", "relays")
+    # Where gains depend on data, moments of the errors are followed along the estimates, but not the plant's own.
+    needs_plant_moments = fusion.by_report or fusion.rule.needs_plant_moments
+    if needs_plant_moments and has_data_dependent_gains(parts):
+        _, _, first_filter = next(iter(parts.values()))
+        raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
+                   type(first_filter).__name__)  # fmt: skip
+    claim = find_claim_of_informed_fusion(rule, network.plant, parts, shared=network.common is not None)
+    if not fusion.by_report:
+        return claim
+    return find_claim_of_report_fusion(rule, claim, fusion, {n: network.nodes[n].complete for n in names})

@@ -1,0 +1,102 @@
+"""Tests of the innovations of a filter whose messages declare noise: their sizes by class, and their memory."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from heliograph.filters.wrappers.told_link_law import ToldFilter
+from heliograph.numerics.confidence_intervals import average_correlated
+from heliograph.numerics.types import Float, Int
+from heliograph.simulation.declared_noise.refit import DeclaredRows
+from heliograph.simulation.results.whiteness import whitened_innovations
+
+LEVEL = 0.01  # of each test
+LAGS = 10  # messages over which correlations are tested, at most
+
+
+class NisOfClass(NamedTuple):
+    """Mean square of the innovations of one class, and the interval in which it is if their claim is true.
+
+    Args:
+        mean: of the squares, 1 where the claim is true.
+        low: lower end of the interval.
+        high: upper end.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+class InnovationTests(NamedTuple):
+    """Tests of innovations over their claimed deviation: sizes by class, and correlation over time.
+
+    Args:
+        nis: mean square of each class, with its interval for a true claim.
+        correlation: over one message.
+        p_value: of the correlations over up to ten messages, if there were none in truth.
+    """
+
+    nis: list[NisOfClass]
+    correlation: float
+    p_value: float
+
+    @property
+    def contradicts(self) -> bool:
+        """True if sizes or correlations contradict the declared variances, at 1 % each."""
+        return self.p_value < LEVEL or any(not nis.low <= nis.mean <= nis.high for nis in self.nis)
+
+
+def examine_innovations(
+    declared: DeclaredRows, filter: ToldFilter, classes: Int[np.ndarray, " steps"]
+) -> InnovationTests:
+    """Test the innovations of a filter: their mean squares by class, and their correlation over messages.
+
+    Args:
+        declared: the recording, and the link that is judged.
+        filter: the filter, as declared or refitted.
+        classes: class of each row, -1 of a row that is not used.
+    """
+    # Innovations of this link's values over their claimed deviation: independent with variance 1 if the claim is true.
+    white = whitened_innovations(declared.z, filter, declared.u)[:, declared.place.values]
+    # Probability of each end of a class's interval, so that all classes together contradict a true claim in LEVEL.
+    tail = LEVEL / declared.classes / 2
+    nis = list[NisOfClass]()
+    for number in range(declared.classes):
+        squares = white[classes == number] ** 2
+        count = int(np.sum(~np.isnan(squares)))
+        mean = float(np.nansum(squares) / count)
+        if filter.knows_gain:  # count times the mean is chi-squared of `count` degrees of freedom
+            quantiles = (2 * scipy.special.gammaincinv(count / 2, p) / count for p in (tail, 1 - tail))
+            low, high = quantiles if count else (0, 1)  # without values anything will do: the mean is NaN
+        else:  # Gaussian, with an error that counts correlations between rows
+            _, error = average_correlated(np.nanmean(squares, axis=1))
+            low, high = 1 + error * scipy.special.ndtri(tail), 1 - error * scipy.special.ndtri(tail)
+        nis.append(NisOfClass(mean, float(low), float(high)))
+    correlation, p_value = _test_correlation(white[classes >= 0], filter.knows_gain)
+    return InnovationTests(nis, correlation, p_value)
+
+
+def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
+    """Return the correlation r_1 of innovations one message apart, and the p-value of r_1, ..., r_10 together.
+
+    r_l = sum_k u_k u_(k-l) / sum_k u_k^2. Without memory the sum over l of the squares, each in units of its variance,
+    is chi-squared. The variance is that of Ljung and Box where innovations are independent, else estimated.
+
+    Args:
+        white: innovations u in units of their claimed deviation, NaN where none is; of few rows fewer lags are tested.
+        exact: whether innovations are independent if their claim is true.
+    """
+    rows, count = len(white), int(np.sum(~np.isnan(white)))
+    lags = min(LAGS, rows // 10)
+    power = np.nansum(white**2)
+    products = [white[lag:] * white[:-lag] for lag in range(1, lags + 1)]
+    r = np.array([np.nansum(product) for product in products]) / power
+    if exact:
+        squared = count * (rows + 2) * r**2 / (rows - np.arange(1, lags + 1))
+    else:
+        sums = [average_correlated(np.nansum(product, axis=1)) for product in products]
+        squared = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
+    p_value = scipy.special.gammaincc(lags / 2, np.sum(squared) / 2)  # upper tail of chi-squared, `lags` degrees
+    return float(r[0]), float(p_value)

@@ -1,0 +1,400 @@
+"""Whether variances that messages declare are true: sizes and memory of innovations, and what a refit says of both."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+import scipy
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.run_over_data import check_data
+from heliograph.filters.wrappers.told_link_law import ToldFilter
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.check import fail, instance, show_value
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
+from heliograph.random_affine.reported_law import AbstractTold
+from heliograph.simulation.declared_noise.innovation_tests import LEVEL, InnovationTests, examine_innovations
+from heliograph.simulation.declared_noise.refit import (
+    DeclaredRows,
+    ReceivedLinkPlace,
+    Refit,
+    find_interval_end,
+    find_link_place,
+    list_links_declaring_noise,
+    list_noise_variances,
+    refit_filter,
+    refit_scales,
+    refit_with_bias,
+)
+from heliograph.simulation.runs.map_over_runs import over_runs
+
+FEWEST = 20  # rows with values, below which nothing is judged
+MOST = 2000  # rows that decide
+CLASSES = 4  # of declared variances, at most
+EACH = 60  # numbers in a class at least, which show a factor of 2 of the innovations' variance in 9 of 10 recordings
+LEAST = 1.1  # ratio of variances from which one is worth a sentence
+
+
+@readable
+class DeclaredClass(NamedTuple):
+    """Messages of similar declared variances, and what the innovations say of these.
+
+    Args:
+        low: smallest declared variance, the geometric mean over the outputs.
+        high: largest one.
+        numbers: values that arrived.
+        nis: mean square of the innovations over their claimed variance; 1 where the claim holds.
+        nis_low: lower end of the interval in which it is for a true claim, in 99 of 100 recordings for all classes.
+        nis_high: upper end.
+        scale: factor of the declared variances that fits best, without a bias; 1 where nothing contradicts them.
+        scale_low: lower end of its 95 % interval.
+        scale_high: upper end.
+    """
+
+    low: float
+    high: float
+    numbers: int
+    nis: float
+    nis_low: float
+    nis_high: float
+    scale: float
+    scale_low: float
+    scale_high: float
+
+
+@readable
+class DeclaredBias(NamedTuple):
+    """A bias of each output that explains what no scale of the declared variances does.
+
+    Args:
+        deviation: its deviation, of each output (outputs,).
+        time: its memory, in the time of the plant.
+        time_low: lower end of the 95 % interval of the memory.
+        time_high: upper end; infinite where the recording does not bound it.
+        times_white: declared deviation over that of the white part, of all classes the smallest.
+        times_white_low: lower end of its interval.
+        gain: nats by which the likelihood is higher with it.
+    """
+
+    deviation: Float[np.ndarray, " outputs"]
+    time: float
+    time_low: float
+    time_high: float
+    times_white: float
+    times_white_low: float
+    gain: float
+
+
+@readable
+@dataclass(frozen=True)
+class DeclaredJudgement:
+    """Judgement of the variances that messages of one link declare, by a recording.
+
+    Args:
+        outputs: names of the outputs that the link carries; none where its values are not outputs one by one.
+        classes: messages by declared variance, in its order.
+        correlation: of innovations one message apart, as declared.
+        p_value: of correlations over up to ten messages, if there were none.
+        refit_correlation: the same after the variances are scaled.
+        refit_p_value: p-value of these.
+        bias: what explains the innovations where no scale does; None where one does, or nothing is wrong.
+    """
+
+    outputs: tuple[str, ...]
+    classes: tuple[DeclaredClass, ...]
+    correlation: float
+    p_value: float
+    refit_correlation: float
+    refit_p_value: float
+    bias: DeclaredBias | None
+
+    @property
+    def contradicted(self) -> bool:
+        """True if sizes or memory of the innovations contradict what was declared, at 1 % each."""
+        sizes = any(not c.nis_low <= c.nis <= c.nis_high for c in self.classes)
+        return sizes or self.p_value < LEVEL
+
+    def sentences(self, unit: str = "steps") -> list[str]:
+        """Return what is to be said, a line each; nothing where the declared variances may be true.
+
+        Args:
+            unit: of the plant's time; steps by default.
+        """
+        if not self.contradicted:
+            return []
+        if self.bias is not None:
+            return _describe_bias(self.bias, unit)
+        if self.refit_p_value < LEVEL:
+            return [
+                "neither a scale of the declared variances nor a bias explains the innovations: correlated over one "
+                f"message ({self.refit_correlation:.2f}) after a refit, by something that the model forgets"
+            ]
+        lines = [line for one in self.classes for line in _describe_scale(one, len(self.classes) > 1)]
+        worst = max((one.nis for one in self.classes if not one.nis <= LEAST * one.nis_high), default=0.0)
+        unexplained = f"no scale explains the innovations, whose squares are {worst:.3g} times what is claimed"
+        return lines or [unexplained] * bool(worst)
+
+
+def judge_declared(
+    filter: AbstractFilter,
+    data: "Float[ArrayLike, 'steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+) -> DeclaredJudgement:
+    """Judge the variances that messages declare by a recording, with the plant as it is.
+
+    Innovations in claimed deviations u are tested twice at 1 %: the mean square of each class of declared variances,
+    and the correlation over up to ten messages, r_l = sum u_k u_(k-l) / sum u^2, which is in units of what was seen,
+    not of what was claimed. Small innovations alone mean nothing: variances that are too large, and an error that
+    changes slowly, look alike. So variances are scaled to fit best, R = s a for each class, and the tests repeated: if
+    they pass, a scale was wrong; if not, a Gauss-Markov bias of each output is fitted beside the scales, and taken if
+    the likelihood says so.
+
+    Args:
+        filter: a filter behind a link whose Gaussian noise is told (`hg.model.told`).
+        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
+            2,000 rows count.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Raises:
+        ValueError: a filter that is told no noise, or by several links (`judge_declared_links`), data or inputs of the
+            wrong shape, fewer than 20 rows with values.
+    Source: Ljung and Box (1978) for the correlations; Newey and West (1987) for errors where gains are random.
+    """
+    links = list_links_declaring_noise(filter) if isinstance(filter, ToldFilter) else []
+    if len(links) != 1:
+        got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
+        expected = "one whose link tells the variance of its Gaussian noise (hg.model.told)"
+        several = f"one of {len(links)} such links, which judge_declared_links judges"
+        raise fail("filter", expected, several if links else got)
+    assert isinstance(filter, ToldFilter)  # it has a link that declares
+    z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
+    judgement, heard = _judge_link(filter, links[0], z, u)
+    if judgement is None:
+        raise fail("data", f"at least {FEWEST} rows with values and what is declared of them", heard)
+    return judgement
+
+
+def judge_declared_links(
+    filter: AbstractFilter,
+    data: "Float[ArrayLike, 'steps received']",
+    inputs: "Float[ArrayLike, 'steps inputs'] | None" = None,
+) -> tuple[DeclaredJudgement, ...]:
+    """Judge what each link declares of its noise, as `judge_declared` does, with the others as they declare it.
+
+    Of a filter that receives several nodes, one after another in their order; of a filter that is told no noise, and
+    of links of fewer than 20 rows with values, none.
+
+    Args:
+        filter: a filter.
+        data: values and what was declared of them (steps, received), NaN where a component did not arrive; the first
+            2,000 rows count.
+        inputs: rows (steps, inputs); by default a filter without inputs is assumed.
+
+    Raises:
+        ValueError: no filter, data or inputs of the wrong shape.
+    """
+    instance("filter", filter, AbstractFilter, "a filter")
+    z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
+    if not isinstance(filter, ToldFilter):
+        return ()
+    judged = [_judge_link(filter, link, z, u)[0] for link in list_links_declaring_noise(filter)]
+    return tuple(judgement for judgement in judged if judgement is not None)
+
+
+def _judge_link(
+    filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
+) -> tuple[DeclaredJudgement | None, int]:
+    """Return the judgement of one link, None where too few of its values came; and how many rows had some.
+
+    `link`: its number, as of `list_links_declaring_noise`. `z` and `u`: measurements and inputs.
+    """
+    declared, classes = _classify_rows(filter, link, z, u)
+    heard = int(np.sum(classes >= 0))
+    if heard < FEWEST:
+        return None, heard
+    # With the variances as declared: where the innovations fit them, all scales are 1.
+    before = examine_innovations(declared, filter, classes)
+    if not before.contradicts:
+        ones = np.ones(declared.classes)
+        return _make_judgement(declared, classes, (before, before), (ones, ones, ones), None), heard
+    # With the scales that fit best. Where innovations are still correlated over time, a bias is tried beside them.
+    refit = refit_scales(declared)
+    after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
+    bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
+    low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
+    scales = np.exp(refit.logs), np.exp(low), np.exp(high)  # of each class, with the ends of their intervals
+    return _make_judgement(declared, classes, (before, after), scales, bias), heard
+
+
+class _DeclaredVariances(eqx.Module):
+    """The variances of a told link's noises as a function of the numbers that it is told."""
+
+    told: AbstractToldMap
+
+    def __call__(self, numbers: Array) -> Array:
+        """Return the variances of these numbers' noises, one after another."""
+        return list_noise_variances(self.told.believed(numbers))
+
+
+def _compute_declared_variances(
+    place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
+) -> Float[np.ndarray, "steps outputs"]:
+    """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
+
+    Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
+    """
+    numbers = z[:, place.numbers]
+    complete = ~np.isnan(numbers).any(axis=1)[:, None]
+    filled = np.where(complete, numbers, np.asarray(place.told.typical))
+    variances = np.asarray(over_runs(_DeclaredVariances(place.told), filled))
+    return np.asarray(np.where(complete, variances, np.nan))
+
+
+def _classify_rows(
+    filter: ToldFilter, link: int, z: Float[np.ndarray, "steps received"], u: Float[np.ndarray, "steps inputs"]
+) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
+    """Divide a link's rows into classes of similar declared variances; arguments as of `_judge_link`.
+
+    A row's size is the mean logarithm of the variances that its message declares.
+
+    Returns:
+        The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
+    """
+    z, place = z.copy(), find_link_place(filter, link)
+    with np.errstate(all="ignore"):
+        # Messages whose numbers give no positive variance count as lost: they would spoil the filter's state.
+        for number in list_links_declaring_noise(filter):
+            declaring = find_link_place(filter, number)
+            valid = np.all(_compute_declared_variances(declaring, z) > 0, axis=1, keepdims=True)
+            z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
+        variances = _compute_declared_variances(place, z)
+        log_size = np.mean(np.log(variances), axis=1)
+    # Rows in which the link declared something and a value came.
+    heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
+    # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
+    numbers = int(np.sum(~np.isnan(z[heard][:, place.values])))
+    classes = min(CLASSES, len(np.unique(log_size[heard])), max(numbers // EACH, 1))
+    sizes, shares = log_size[heard], np.arange(1, classes) / max(classes, 1)
+    inner = np.quantile(sizes, shares, method="lower") if heard.any() else np.empty(0)
+    edges = np.array([edge for edge in np.unique(inner) if edge < sizes.max()])
+    # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
+    outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
+    usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
+    deviation = usual if len(usual) == outputs else np.full(outputs, np.exp(np.mean(np.log(usual))))
+    return DeclaredRows(filter, link, edges, deviation, z, u), np.where(heard, np.searchsorted(edges, log_size), -1)
+
+
+def _find_bias(declared: DeclaredRows, scales: Refit) -> DeclaredBias | None:
+    """Return the bias of each output that fits beside the scales; None where it is not significant, at 1 %."""
+    filter = declared.filter
+    # A bias is a further state: not for models that vary over time, nor for values that are no outputs one by one.
+    varies = not (isinstance(filter.plant, AbstractPlant) and isinstance(filter.sensor, AbstractSensor))
+    if varies or declared.place.outputs is None:
+        return None
+    best = refit_with_bias(declared, scales)
+    gain = best.likelihood - scales.likelihood
+    # With two numbers more and no bias in truth, twice the gain is chi-squared of two degrees of freedom.
+    if gain < scipy.special.gammainccinv(1, LEVEL):
+        return None
+    # best.logs: scale of each class, then the bias's deviation over the root of its memory, then the memory.
+    count = declared.classes
+    rate, time = np.exp(best.logs[count:])
+    at_memory = count + 1
+    time_low, time_high = (float(np.exp(find_interval_end(declared, best, at_memory, sign))) for sign in (-1, 1))
+    # A scale s = (white / declared deviation)^2: declared over white is s^-1/2, smallest for the largest s.
+    largest = np.max(best.logs[:count])
+    largest_end = max(find_interval_end(declared, best, number, 1) for number in range(count))
+    return DeclaredBias(
+        deviation=rate * np.sqrt(time) * declared.deviation,
+        time=float(time),
+        time_low=time_low,
+        time_high=time_high,
+        times_white=float(np.exp(-largest / 2)),
+        times_white_low=float(np.exp(-largest_end / 2)),
+        gain=gain,
+    )
+
+
+def _make_judgement(
+    declared: DeclaredRows,
+    classes: Int[np.ndarray, " steps"],
+    tested: tuple[InnovationTests, InnovationTests],
+    scales: tuple[np.ndarray, np.ndarray, np.ndarray],
+    bias: DeclaredBias | None,
+) -> DeclaredJudgement:
+    """Return the judgement of what was found; messages of similar declared variances are one class.
+
+    Args:
+        declared: the filter and the recording.
+        classes: class of each row, -1 of a row that is not used.
+        tested: tests of the innovations, before and after the refit.
+        scales: of each class, with the lower and the upper ends of their intervals, (classes,) each.
+        bias: what explains the innovations where no scale does; None without.
+    """
+    before, after = tested
+    place, judged_classes = declared.place, []
+    for class_index, (nis, nis_low, nis_high) in enumerate(before.nis):
+        # What each message of the class declares: one variance, the geometric mean over the outputs.
+        rows = declared.z[classes == class_index]
+        variances = np.exp(np.mean(np.log(_compute_declared_variances(place, rows)), axis=1))
+        scale, scale_low, scale_high = (float(values[class_index]) for values in scales)
+        judged_classes.append(
+            DeclaredClass(
+                low=float(variances.min()),
+                high=float(variances.max()),
+                numbers=int(np.sum(~np.isnan(rows[:, place.values]))),
+                nis=nis,
+                nis_low=nis_low,
+                nis_high=nis_high,
+                scale=scale,
+                scale_low=scale_low,
+                scale_high=scale_high,
+            )
+        )
+    names = first(declared.filter.sensor).outputs
+    return DeclaredJudgement(
+        outputs=tuple(names[i] for i in place.outputs or ()),  # none where values are not outputs one by one
+        classes=tuple(judged_classes),
+        correlation=before.correlation,
+        p_value=before.p_value,
+        refit_correlation=after.correlation,
+        refit_p_value=after.p_value,
+        bias=bias,
+    )
+
+
+def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
+    """Return lines on how large a bias is, how long it lasts in this unit of time, and what to do."""
+    lines = []
+    if bias.times_white_low > np.sqrt(LEAST):
+        bounded = bias.times_white < 2 * bias.times_white_low
+        times = f"{_two_digits(bias.times_white)}" if bounded else f"at least {_two_digits(bias.times_white_low)}"
+        lines.append(f"the declared deviation is {times} times the white part of the error")
+    ends = f"{_two_digits(bias.time_low)} to {_two_digits(bias.time_high)}" if np.isfinite(bias.time_high) else (
+        f"at least {_two_digits(bias.time_low)}")  # fmt: skip
+    lines.append(
+        f"the error has a memory of about {_two_digits(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
+    )
+    return lines
+
+
+def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
+    """Return a line on how much too large or small a class's variances are, if any; it is named if `several` are."""
+    if one.scale_low < LEAST and one.scale_high > 1 / LEAST:
+        return []
+    times, low, high = one.scale, one.scale_low, one.scale_high
+    kind = "small"
+    if one.scale < 1:
+        times, low, high, kind = 1 / one.scale, 1 / one.scale_high, 1 / one.scale_low, "large"
+    of = f" from {one.low:.3g} to {one.high:.3g}" if several else ""
+    factor = f"{_two_digits(times)} times too {kind} ({_two_digits(low)} to {_two_digits(high)})"
+    return [f"declared variances{of} are {factor}; scaled so, the innovations pass"]
+
+
+def _two_digits(value: float) -> str:
+    """Return a number, rounded to two digits, as text."""
+    return f"{float(f'{value:.2g}'):,.15g}"

@@ -1,0 +1,323 @@
+"""Refit of declared noise to a recording: a scale for each class of messages, and a bias beside it, by likelihood.
+
+Messages that declare noise tell their receiver how precise they are; such numbers are called told. Classes are messages
+of similar declared variance. A bias is an error of an output that fades with a time constant, its memory.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+
+from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.model.augmented.bias import with_bias
+from heliograph.model.channel_side_information import LinkGivenNumbers
+from heliograph.model.over_time import first
+from heliograph.model.plant import TIME_STEP, AbstractPlant
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.channel_state_information import (
+    AbstractToldMap,
+    ToldGainHop,
+    ToldMap,
+    list_told_maps,
+    list_told_numbers_of_outputs,
+)
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.simulation.likelihood import log_likelihood
+from heliograph.simulation.runs.map_over_runs import over_runs
+
+ALMOST = 2**-20  # by which typical numbers are moved, to see whether a noise depends on them
+REACH = 1.92  # nats below the maximum at the ends of a 95 % interval of one number: half of chi-squared's 3.84
+FARTHEST = 40.0  # of a logarithm, beyond which a scale has no end
+FAST, SLOW = 0.5, 1e4  # of a bias's memory: shortest in steps, longest in lengths of the recording
+TIMES = (5.0, 50.0)  # steps: memories from which the search begins
+DIFFERENCE = 1e-4  # of logarithms, for slopes
+SLOPE = 3e-3  # nats for a factor of e in a number, at which it is at its best
+CLOSE = 0.05  # of a logarithm: as near as the end of an interval is found
+LOST = 1e12  # nats by which numbers that give no likelihood (NaN, or one of 0) are worse than any
+
+
+class DeclaredRows(NamedTuple):
+    """A filter of messages that declare noise, with what those of one link declared in the rows of a recording.
+
+    Args:
+        filter: the filter.
+        link: which of the links that tell numbers (`list_told_maps`): its noise is judged, that of others is as
+            declared.
+        edges: logarithms of declared variances at which one class of messages ends and the next begins (classes - 1,).
+        deviation: usual declared deviation of each output of the link (outputs,).
+        z: measurements (steps, received).
+        u: inputs (steps, inputs).
+    """
+
+    filter: ToldFilter
+    link: int
+    edges: Float[np.ndarray, " edges"]
+    deviation: Float[np.ndarray, " outputs"]
+    z: Float[np.ndarray, "steps received"]
+    u: Float[np.ndarray, "steps inputs"]
+
+    @property
+    def classes(self) -> int:
+        """Number of classes of messages."""
+        return len(self.edges) + 1
+
+    @property
+    def place(self) -> "ReceivedLinkPlace":
+        """Return where the link stands in what is received."""
+        return find_link_place(self.filter, self.link)
+
+
+class ReceivedLinkPlace(NamedTuple):
+    """Where a link that tells numbers stands in what is received, and which of the sensor's outputs it carries.
+
+    Args:
+        told: the map of which numbers are told.
+        numbers: rows of z of these numbers.
+        values: rows of z of the values whose law they give.
+        outputs: outputs of the sensor that the link carries; None where values are not outputs one by one.
+    """
+
+    told: AbstractToldMap
+    numbers: list[int]
+    values: list[int]
+    outputs: list[int] | None
+
+
+def find_link_place(filter: ToldFilter, link: int) -> ReceivedLinkPlace:
+    """Return the place of one of the links that tell numbers.
+
+    Args:
+        filter: the filter of all.
+        link: its number among `list_told_maps`.
+    """
+    # Columns of its numbers among all that are told, and rows of the values on which they have an effect.
+    maps, sensor = list_told_maps(first(filter.link)), first(filter.sensor)
+    before = sum(affine.memory.announced for affine in maps[:link])
+    columns = list(range(before, before + maps[link].memory.announced))
+    of_link = np.flatnonzero(list_told_numbers_of_outputs(first(filter.link))[:, columns].any(axis=1)).tolist()
+    whole = len(of_link) == len(filter.values)  # all that is received comes over this link
+    outputs = list(range(len(sensor.outputs))) if whole else of_link
+    return ReceivedLinkPlace(
+        told=maps[link],
+        numbers=[filter.numbers[column] for column in columns],
+        values=[filter.values[row] for row in of_link],
+        outputs=outputs if whole or len(sensor.outputs) == len(filter.values) else None,
+    )
+
+
+class LinkWithScaledNoise(eqx.Module):
+    """The link that declared numbers give, its noise times the scale of their class.
+
+    Args:
+        make: the link of these numbers, as it is declared.
+        edges: logarithms of variances between classes (classes - 1,).
+        scales: of the classes (classes,).
+    """
+
+    make: LinkGivenNumbers
+    edges: Array
+    scales: Array
+
+    def __call__(self, numbers: Array) -> AbstractRandomAffine:
+        """Return the link of these declared numbers, with its noise scaled."""
+        link = self.make(numbers)
+        # Class: how many edges the mean logarithm of the variances is above.
+        size = jnp.mean(jnp.log(list_noise_variances(link)))
+        scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
+
+        def rescale(leaf: object) -> object:
+            """Return a noise with its covariance scaled; anything else as it is."""
+            return Gaussian(scale * leaf.covariance, leaf.mean) if isinstance(leaf, AbstractNoise) else leaf
+
+        scaled: AbstractRandomAffine = jax.tree.map(rescale, link, is_leaf=_is_noise)
+        return scaled
+
+
+def list_noise_variances(link: AbstractRandomAffine) -> jax.Array:
+    """Return the variances of all noises inside a link, one after another."""
+    return jnp.concatenate([jnp.diagonal(jnp.asarray(noise.covariance)) for noise in _list_link_noises(link)])
+
+
+def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
+    """Return the links, by number, whose messages tell the variances of Gaussian noise, which a scale may correct."""
+    maps = list_told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
+    return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
+
+
+@in_float64
+def _declares_noise(affine: ToldMap) -> bool:
+    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise."""
+    if isinstance(affine.make, ToldGainHop):
+        return False
+    typical = np.asarray(affine.typical)
+    noises, moved = (_list_link_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
+    changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
+    return changes and all(isinstance(noise, Gaussian) for noise in noises)
+
+
+def _list_link_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
+    """Return all noises inside a link."""
+    return [leaf for leaf in jax.tree.leaves(link, is_leaf=_is_noise) if _is_noise(leaf)]
+
+
+def _is_noise(leaf: object) -> bool:
+    """Return whether a part of a link is a noise."""
+    return isinstance(leaf, AbstractNoise)
+
+
+def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
+    """Return the filter with the link's noise scaled, and a bias of each of its outputs where two numbers describe one.
+
+    Args:
+        declared: the filter and the recording.
+        logs: logarithms of the scale of each class (classes,). With a bias (classes + 2,): then of its deviation over
+            the root of its memory, in units of the deviation declared, which data tell better than the deviation
+            itself; and of its memory, in the time of the plant.
+    """
+    filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
+
+    def rescale(leaf: object) -> object:
+        """Return the judged link's map with its noise scaled; anything else as it is."""
+        if not isinstance(leaf, ToldMap) or leaf.memory.identity != place.told.memory.identity:
+            return leaf
+        scaled = LinkWithScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
+        return eqx.tree_at(lambda affine: affine.make, leaf, scaled)
+
+    link = jax.tree.map(rescale, filter.link, is_leaf=lambda leaf: isinstance(leaf, ToldMap))
+    plant, sensor = filter.plant, filter.sensor
+    # A bias of the outputs that the link carries: one more state of the plant for each.
+    has_bias = len(logs) > declared.classes
+    if has_bias:
+        assert isinstance(plant, AbstractPlant) and isinstance(sensor, AbstractSensor)
+        rate, time = numbers[declared.classes :]
+        dt = TIME_STEP if TIME_STEP in plant.inputs else 1.0
+        deviation, loading = rate * jnp.sqrt(time) * declared.deviation, np.eye(len(sensor.outputs))[:, place.outputs]
+        plant, sensor = with_bias(plant, sensor, deviation, time, dt, loading=loading)
+    return filter.with_models(plant, sensor, link)
+
+
+class RefitLikelihood(eqx.Module):
+    """The log-likelihood of a recording as a function of the numbers that `refit_filter` takes."""
+
+    declared: DeclaredRows
+
+    def __call__(self, logs: Array) -> Array:
+        """Return the log-likelihood of these numbers, in nats."""
+        refit = refit_filter(self.declared, logs)
+        return jnp.asarray(log_likelihood(refit, self.declared.z, self.declared.u))
+
+
+class Refit(NamedTuple):
+    """Numbers by which declared noise fits a recording best.
+
+    Args:
+        logs: their logarithms, as `refit_filter` takes them.
+        likelihood: log-likelihood there, in nats.
+    """
+
+    logs: Float[np.ndarray, " numbers"]
+    likelihood: float
+
+
+def refit_scales(declared: DeclaredRows) -> Refit:
+    """Return the scale of each class that fits best, with everything else as the filter has it."""
+    return _maximise_likelihood(declared, np.zeros(declared.classes))
+
+
+def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
+    """Return the scales, and the deviation and memory of a bias of each output, that fit best.
+
+    `scales`: the best without a bias, from which the search begins.
+    """
+    step = find_median_step(declared)
+    white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
+    starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
+    return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+
+
+def find_median_step(declared: DeclaredRows) -> float:
+    """Return the median time of a step of the recording; 1 where the plant counts steps."""
+    inputs = declared.filter.inputs
+    return float(np.median(declared.u[:, inputs.index(TIME_STEP)])) if TIME_STEP in inputs else 1.0
+
+
+def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: int) -> float:
+    """Return an end of the 95 % interval of the logarithm of a number; infinite where the likelihood never falls.
+
+    At the end the likelihood, the other numbers at their best, is 1.92 nats (REACH) below its maximum.
+
+    Args:
+        declared: the filter and the recording.
+        best: the maximum.
+        number: which of the numbers.
+        sign: 1 for the upper end, -1 for the lower one.
+    """
+    constrained = best
+
+    def compute_excess_fall(distance: float) -> float:
+        """Return by how much the likelihood falls at this distance from the best number, less REACH."""
+        nonlocal constrained  # each search starts from the last one's result
+        start = constrained.logs.copy()
+        start[number] = best.logs[number] + sign * distance
+        constrained = _maximise_likelihood(declared, start, fixed=number)
+        return best.likelihood - constrained.likelihood - REACH
+
+    # The distance is doubled until the end is passed; then the span that holds the end is halved.
+    near, far = 0.0, 0.25
+    while compute_excess_fall(far) < 0:
+        near, far = far, 2 * far
+        if far > FARTHEST:
+            return sign * np.inf
+    while far - near > CLOSE:
+        middle = (near + far) / 2
+        near, far = (middle, far) if compute_excess_fall(middle) < 0 else (near, middle)
+    return float(best.logs[number] + sign * far)
+
+
+def _maximise_likelihood(
+    declared: DeclaredRows, start: Float[np.ndarray, " numbers"], fixed: int | None = None
+) -> Refit:
+    """Return the maximum of the likelihood that a search finds from a start.
+
+    Args:
+        declared: the filter and the recording.
+        start: logarithms of each class's scale and, with a bias, its two, as of `refit_filter`.
+        fixed: index of one that stays; None if all are free.
+    """
+    # Limits of the logarithms: FARTHEST either way; of a bias's memory FAST steps and SLOW recordings.
+    free = np.arange(len(start)) != fixed
+    low, high = np.full(len(start), -FARTHEST), np.full(len(start), FARTHEST)
+    has_bias = len(start) > declared.classes
+    if has_bias:
+        time_step = find_median_step(declared)
+        low[-1], high[-1] = np.log(FAST * time_step), np.log(SLOW * len(declared.z) * time_step)
+    likelihood = RefitLikelihood(declared)
+    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
+
+    def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
+        """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
+
+        `logs`: the free ones of all logarithms.
+        """
+        all_logs = start.copy()
+        all_logs[free] = logs
+        points = np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)])
+        points = np.clip(points, low, high)  # flat beyond the limits
+        values = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
+        above, below = np.split(values[1:], 2)
+        return float(values[0]), (above - below) / (2 * DIFFERENCE)
+
+    if not free.any():  # the only number is fixed: there is nothing to search
+        loss, _ = compute_loss(start[free])
+        return Refit(start, -loss)
+    found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
+    logs = start.copy()
+    logs[free] = found.x
+    return Refit(np.clip(logs, low, high), -float(found.fun))

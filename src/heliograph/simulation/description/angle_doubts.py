@@ -1,0 +1,179 @@
+"""Doubts about angles: one that is known no better than a good part of the circle, and degrees among radians."""
+
+from collections.abc import Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.moment_transforms import Cubature
+from heliograph.filters.gaussian.unscented import Unscented
+from heliograph.model.over_time import first
+from heliograph.model.sensor import is_linear
+from heliograph.numerics.angle import TURN
+from heliograph.numerics.check import fail, instance, show_value
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.simulation.description.observability import list_sensors
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.record import Record
+
+WIDE = 1.0  # rad: a Gaussian of this deviation has E cos = 0.61, and what lies beyond pi is not on the circle any more
+REMEDY = "on the circle that is no Gaussian any more: start from an angle that data show"
+
+
+def find_largest_usable_deviation(filter: AbstractFilter) -> float:
+    """Return the deviation of an angle up to which a filter can take it for a Gaussian, in radians.
+
+    No more than WIDE; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may not lie
+    beyond half a turn, where they are taken for points of the other side.
+    """
+    inner = getattr(filter, "base", filter)
+    transform, n = getattr(inner, "transform", None), len(filter.states)
+    if isinstance(inner, GaussianFilter) and is_linear(inner.plant, inner.sensor):  # no points are drawn
+        return WIDE
+    if isinstance(transform, Cubature):
+        return min(WIDE, float(np.pi / n**0.5))
+    if isinstance(transform, Unscented):
+        return min(WIDE, float(np.pi / (float(transform.alpha) * (n + float(transform.kappa)) ** 0.5)))
+    return WIDE
+
+
+def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
+    """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
+    lines: dict[tuple[str, str, float], list[str]] = {}
+    for node, label, filter in _yield_filters_with_angles(network):
+        covariance = np.asarray(filter.estimate(filter.init()).covariance)
+        for name, deviation in _yield_deviations(network, filter, covariance):
+            if deviation > find_largest_usable_deviation(filter):
+                lines.setdefault((name, label, float(deviation)), []).append(node)
+    for (name, label, known), nodes in lines.items():
+        where = f"{label!r} of {', '.join(map(repr, nodes[:3]))}{', ...' if len(nodes) > 3 else ''}"
+        yield f"wide angle: {where} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
+
+
+def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each filter that knew an angle less well in some row than it can use."""
+    for node, label, filter in _yield_filters_with_angles(network):
+        covariance = np.asarray(record.estimates[node][label].covariance)
+        for name, deviation in _yield_deviations(network, filter, covariance):
+            wide = np.flatnonzero(deviation > find_largest_usable_deviation(filter))
+            if wide.size:
+                known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
+                rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
+                yield f"{node}/{label}: {known} {rows}; {REMEDY}"
+
+
+@readable
+class WideAngles:
+    """Watch the variances of a filter's states, in rows of an array, for an angle known less well than it can use.
+
+    Each angle is said once, and each received one that is beyond a full turn, as degrees are. `states` and `received`
+    are the names of those that are watched, by their places.
+
+    Args:
+        filter: the filter.
+        names: of the numbers that it receives; by default measurement[0], measurement[1], ...
+
+    Raises:
+        ValueError: no filter, names of another number.
+    """
+
+    def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
+        instance("filter", filter, AbstractFilter, "a filter")
+        used = None if filter.claim == "none" else filter.angles_used()
+        self.states = {} if used is None else {i: filter.states[i] for i in used.states}
+        if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
+            raise fail("names", f"those of {filter.received} received numbers", show_value(names))
+        names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
+        self.received = {} if used is None else {i: names[i] for i in used.received}
+        self._most = find_largest_usable_deviation(filter) if self.states else np.inf
+
+    def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
+        """Return a row and a line for each received angle that is beyond a full turn for the first time."""
+        said = []
+        for i in list(self.received):
+            far = np.flatnonzero(np.abs(values[:, i]) > TURN)
+            if far.size:
+                said.append((int(far[0]), doubt_degrees(self.received.pop(i), values[far[0], i])))
+        return said
+
+    def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
+        """Return a row and a line for each angle that is known so badly for the first time."""
+        said = []
+        for i in list(self.states):
+            wide = np.flatnonzero(variances[:, i] > self._most**2)
+            if wide.size:
+                known = f"{self.states.pop(i)!r} is known to +- {variances[wide[0], i] ** 0.5:.2g} rad"
+                said.append((int(wide[0]), f"{known}; {REMEDY}"))
+        return said
+
+
+def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
+    """Yield (node, name, filter) of the filters that have angles."""
+    if not first(network.plant).circular:
+        return
+    for node, here in network.nodes.items():
+        yield from ((node, label, filter) for label, filter in here.filters.items() if filter.angles_used())
+    for label, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter) and fusion.angles_used():
+            yield FUSED, label, fusion
+
+
+def _yield_deviations(
+    network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
+) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
+    """Yield the name and the deviation of each angle of a filter that claims this covariance."""
+    used = filter.angles_used()
+    for i in () if used is None or filter.claim == "none" else used.states:
+        yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
+
+
+def doubt_degrees_at_start(network: Network) -> Iterator[str]:
+    """Yield a line for each angle that a model has beyond a full turn before any data, as degrees are.
+
+    Looked at are initial means of states, limits of nodes, and what sensors measure at that mean with inputs of 1.
+    """
+    plant = first(network.plant)
+    start, u = np.asarray(plant.initial_mean, dtype=float), np.ones(len(plant.inputs))
+    # Initial means.
+    for i in plant.angles:
+        if line := doubt_degrees(plant.states[i], start[i]):
+            yield f"degrees: the initial mean of {line}"
+    # The larger limit of each angle that a node receives.
+    for name, angles in network.angles.items():
+        node, limits = network.nodes[name], network.nodes[name].limits
+        if limits is None:
+            continue
+        for i in angles:
+            ends = [float(end[i]) for end in (limits.low, limits.high) if np.isfinite(end[i])]
+            if line := doubt_degrees(node.received_names[i], max(ends, key=abs, default=0.0)):
+                yield f"degrees: a limit at node {name!r} of {line}"
+    # Angles that sensors measure.
+    for sensor in list_sensors(network):
+        if sensor.angles:
+            with jax.enable_x64(True):
+                measured = np.asarray(sensor.under(plant.inputs, u).measure(jnp.asarray(start)))
+            for i in sensor.angles:
+                if line := doubt_degrees(sensor.outputs[i], measured[i]):
+                    yield f"degrees: what a sensor measures at the initial mean of {line}"
+
+
+def doubt_degrees(name: str, value: float) -> str:
+    """Return a line that this value of the angle `name` is beyond a full turn; "" where it is not."""
+    return f"{name!r}, an angle in radians, is {value:.4g}, beyond 2 pi: degrees?" if abs(value) > TURN else ""
+
+
+def doubt_angles_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
+    """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
+    for name, angles in network.angles.items():
+        names = network.nodes[name].received_names if angles else ()
+        for i in angles:
+            far = np.abs(z[name][:, i]) > TURN
+            if np.any(far):
+                row = int(np.argmax(far))
+                said = f"{np.count_nonzero(far)} of {np.count_nonzero(~np.isnan(z[name][:, i]))} values are beyond 2 pi"
+                value = f"row {row + 1}: {z[name][row, i]:.4g}"
+                yield f"node {name!r}: {names[i]!r} is an angle in radians, and {said}; {value}: degrees?"

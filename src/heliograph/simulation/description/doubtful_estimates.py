@@ -1,0 +1,158 @@
+"""Doubts about estimates at the edge of what is possible: where no sensor shows a state any more, or at its limit."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Linearization
+from heliograph.filters.wrappers.state_limits import LimitedFilter
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, is_linear
+from heliograph.numerics.check import instance
+from heliograph.numerics.types import Bool, Float
+from heliograph.simulation.description.observability import list_sensors, make_observability_matrix, simulate_outputs
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.results.record import Record
+
+LAST = 10  # rows: in the last one and in the one so many before it no sensor shows the state
+MOST = 0.5  # share of the rows, beyond which it is worth a word that an estimate lies at a limit
+HELD = float(np.sqrt(2 / (np.pi - 2)))  # mean over deviation of a Gaussian of mean 0 that is known to be positive
+CLOSE = 1e-3  # relative, of that: a mean that is 0.007 deviations inside its limit
+APART = 10.0  # deviations between two limits, from which the other one changes nothing
+
+
+def doubt_estimates(network: Network, record: Record) -> tuple[str, ...]:
+    """Return a line for each estimate that ends where no sensor shows it, or that lies at a limit in most rows.
+
+    Args:
+        network: the network.
+        record: what `run` of this network returned, over one recording.
+
+    Raises:
+        ValueError: no network, no record.
+    """
+    instance("network", network, Network, "a Network")
+    instance("record", record, Record, "a Record")
+    return *_doubt_unseen_states(network, record), *_doubt_states_at_limits(network, record)
+
+
+def _doubt_unseen_states(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each filter that ends where no sensor shows a state that one showed at the start.
+
+    A state is shown where an output within n steps depends on it, as far as the filter looks (`_FilterView`). Where
+    none does, as beyond the end of a table, the gain of the state is by its correlations alone: what arrives says
+    nothing of where it is. Not judged: states with limits, which bring an estimate back; particles and mixtures; models
+    that vary over time or have modes; estimates that are no numbers.
+    """
+    plant = network.plant
+    if not isinstance(plant, AbstractPlant) or isinstance(plant, ModalPlant):
+        return
+    limited = {name for name, _ in plant.limits}
+    for node, label, filter, sensors in _yield_filters_with_covariance(network):
+        # A filter of one Gaussian, of a nonlinear sensor and of models that do not vary.
+        transform = getattr(filter, "transform", None)
+        if not isinstance(transform, AbstractTransform):
+            continue
+        varies = any(first(sensor) is not sensor or isinstance(sensor, ModalSensor) for sensor in sensors)
+        if varies or all(is_linear(plant, sensor) for sensor in sensors):
+            continue
+        estimate = record.estimates[node][label]
+        means, covariances = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+        # Judged are the last row and the one LAST rows before it, where estimates have to be numbers.
+        if len(means) <= LAST or not np.all(np.isfinite(means[[-1 - LAST, -1]])):
+            continue
+        view = _FilterView(plant, [first(sensor) for sensor in sensors], isinstance(transform, Linearization))
+        for i in np.flatnonzero(_find_unseen_states(view, means, covariances)):
+            name = network.states[i]
+            if name not in limited:
+                yield (
+                    f"{node}/{label}: {name!r} ends at {means[-1, i]:.4g}, where no sensor shows it, as beyond the end "
+                    "of a table: what arrives does not move it. If it cannot be there, limits= of the plant say so"
+                )
+
+
+def _find_unseen_states(
+    view: "_FilterView", means: Float[np.ndarray, "time n"], covariances: Float[np.ndarray, "time n n"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which states outputs depend on at the start, but neither at the last estimate nor LAST rows before it."""
+    plant = view.plant
+    start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+    end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
+    # Over one step first, which is cheap: hardly any recording ends so.
+    if not np.any(view.find_shown(*start, 1) & ~view.find_shown(*end, 1)):
+        return np.zeros(len(plant.states), dtype=bool)
+    steps = len(plant.states)
+    unseen = view.find_shown(*start, steps) & ~view.find_shown(*end, steps) & ~view.find_shown(*before, steps)
+    return np.asarray(unseen)
+
+
+def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
+    """Yield a line for each state with limits that a filter has at one of them in most rows.
+
+    A filter says mean and deviation of its Gaussian given the limits. One whose mean is held at a limit has the mean
+    sqrt(2 / pi) s inside it, and the deviation sqrt(1 - 2 / pi) s: of ratio HELD, and of a larger one where the mean
+    is inside. That holds of one limited state; of several, of which each changes those before it, nearly.
+    """
+    for node, label, filter, _ in _yield_filters_with_covariance(network):
+        if not isinstance(filter, LimitedFilter):
+            continue
+        estimate = record.estimates[node][label]
+        for place, *limits in filter.limits:
+            mean = np.asarray(estimate.mean)[:, place]
+            deviation = np.sqrt(np.maximum(np.asarray(estimate.covariance)[:, place, place], 0.0))
+            for limit in (end for end in limits if np.isfinite(end)):
+                held = (np.abs(mean - limit) <= HELD * (1 + CLOSE) * deviation) & (deviation > 0)
+                held &= np.ptp(limits) > APART * deviation  # so that the other limit changes nothing
+                if np.count_nonzero(held) > MOST * len(mean):
+                    yield (
+                        f"{node}/{label}: {network.states[place]!r} is held at its limit {limit:g} in "
+                        f"{np.count_nonzero(held)} of {len(mean)} rows, as where what arrives puts it beyond: if it is "
+                        "not there, a sensor, the plant or the limit is off"
+                    )
+
+
+def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
+    """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
+    every = list_sensors(network)
+    for name, node in network.nodes.items():
+        sensors = [node.sensor] if isinstance(node, Node) else every
+        yield from ((name, label, one, sensors) for label, one in node.filters.items() if one.claim != "none")
+    for label, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter) and fusion.claim != "none":
+            yield FUSED, label, fusion, every
+
+
+class _FilterView(NamedTuple):
+    """What a filter sees of its state: by the tangent of the sensors, or by their outputs beside its mean.
+
+    Args:
+        plant: the plant.
+        sensors: the sensors that the filter hears, which do not vary.
+        tangent: whether it takes the tangent at its mean.
+    """
+
+    plant: AbstractPlant
+    sensors: Sequence[AbstractSensor]
+    tangent: bool
+
+    def find_shown(
+        self, mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], steps: int
+    ) -> Bool[np.ndarray, " n"]:
+        """Return which states change an output within some steps, for a filter with this mean and covariance.
+
+        Of a tangent those whose column of the observability matrix is not zero. Of points also those for which outputs
+        differ at mean +- sqrt(n) deviations, where `Cubature` has its points if states are not correlated.
+        """
+        by_tangent = np.any(make_observability_matrix(self.plant, self.sensors, mean, steps) != 0, axis=0)
+        if self.tangent or np.all(by_tangent):
+            return np.asarray(by_tangent)
+        spread = np.sqrt(len(mean) * np.maximum(np.diagonal(covariance), 0.0))
+        ahead, behind = (
+            simulate_outputs(self.plant, self.sensors, mean + sign * np.diag(spread), steps) for sign in (1.0, -1.0)
+        )
+        return np.asarray(by_tangent | np.any(ahead != behind, axis=1))

@@ -1,0 +1,45 @@
+"""Remarks of filters on their own states after a run, such as that a gate gave in."""
+
+from collections.abc import Iterator
+
+import jax
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.remark import Remark
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import FUSED, Network
+
+Place = tuple[str, str]  # node and filter
+
+
+def find_remarking_filters(network: Network) -> tuple[Place, ...]:
+    """Return the places of the filters that may remark on their state."""
+    places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
+    fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
+    return *places, *fused
+
+
+def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
+    """Yield each remark that a filter makes on its state, with the filter's place.
+
+    Args:
+        network: the network.
+        state: states of all its filters, as the step of the network has them.
+    """
+    alike, central, *_ = state
+    for node, name in find_remarking_filters(network):
+        if node == FUSED:
+            fusion = network.fused[name]
+            assert isinstance(fusion, AbstractFilter)
+            yield (node, name), fusion.remark(central[name])
+            continue
+        place = network.places[node, name]
+        # A stack has all nodes of its first filter, then all of its second, and so on.
+        row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
+        of_filter = jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind])
+        yield (node, name), network.nodes[node].filters[name].remark(of_filter)
+
+
+def describe_remarks(network: Network, state: PyTree) -> list[str]:
+    """Return a line for each filter to whose state something happened."""
+    return [f"{node}/{name}: {said.words}" for (node, name), said in yield_remarks(network, state) if said.times]

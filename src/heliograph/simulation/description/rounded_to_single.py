@@ -1,0 +1,60 @@
+"""Numbers of a network that were rounded to single precision before it was made, as JAX makes tables by default."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.model.over_time import first
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import InputError
+from heliograph.numerics.numpy_or_jax import constants, find_rounded_to_single, is_traced
+from heliograph.simulation.node import HasNodes, Node
+
+Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
+
+
+def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
+    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}."""
+    parts: dict[tuple[float, float], list[str]] = {}
+    seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
+    for name, model, functions in _yield_models_with_calls(network):
+        if id(model) not in seen:
+            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _yield_arrays(model, functions))), None)
+        rounded = seen[id(model)]
+        if rounded is not None:
+            parts.setdefault(rounded, []).append(name)
+    return parts
+
+
+def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
+    """Yield (name, model, its functions with arguments for each) of plant, sensors, channels and what is shared."""
+    plant, x, u = first(network.plant), np.zeros(len(network.states)), np.zeros(len(network.inputs))
+    yield "plant", network.plant, [(plant.transition, (x, u)), (plant.noise_covariance, (u,))]
+    for name, node in network.nodes.items():
+        if isinstance(node, Node):
+            functions: list[Traced] = []
+            if not isinstance(node.sensor, LinearSensor):
+                functions = [(first(node.sensor).typical(network.inputs).measure, (x,))]
+            yield f"sensor of {name}", node.sensor, functions
+            yield f"channel of {name}", node.channel, []
+    if network.common is not None:
+        yield "sensor and channel of all nodes", network.common, []
+    if network.relays is not None:
+        yield "relays", network.relays, []
+
+
+def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
+    """Yield the arrays of a model, and those that its functions hold."""
+    yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
+    for function, arguments in functions:
+        yield from _collect_arrays(function, *arguments)
+
+
+def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
+    """Return the arrays that a function of a model holds; none of one that cannot be traced by itself."""
+    try:
+        return [x for x in constants(function, *arguments)[0] if not is_traced(x)]
+    except (InputError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
+        return []

@@ -1,0 +1,67 @@
+"""Which filters and fusions of a network take longer than others, and why: those by XLA, and those row by row."""
+
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from heliograph.disk.quoting import join_names
+from heliograph.engine.choice import explain_refusal
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.sensor import without_output_names
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.mesh_building import DENSE, build_mesh
+from heliograph.simulation.network import Network
+
+SHOWN = 3  # of many that are refused for one reason
+
+
+def explain_xla_fallbacks(network: Network) -> list[str]:
+    """Return a line for each reason for which XLA computes filters or fusions: who, and why."""
+    by_reason: dict[str, list[str]] = {}
+    for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
+        by_reason.setdefault(why, []).append(who)
+    return [f"{_join_first_names(refused)}: {why}" for why, refused in by_reason.items()]
+
+
+def describe_sequential_filters(network: Network) -> str:
+    """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
+    sequential = [who for who, filter in _list_filters(network) if not filter.is_linear]
+    return _join_first_names(sequential) if sequential else ""
+
+
+def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
+    """Yield each filter of the network, with who it is in words."""
+    central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+    places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
+    for where, filters in (*places, ("", central)):
+        yield from ((f"filter {label!r}{where}", filter) for label, filter in filters.items())
+
+
+def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield each filter whose step is refused, with the reason."""
+    for who, named in _list_filters(network):
+        filter = without_output_names(named)  # so that filters of one structure are compiled once
+        z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
+        if why := explain_refusal(_step_filter, filter, filter.init(), z, u, np.asarray(0)):
+            yield who, why
+
+
+def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
+    """Return what one step of a filter returns for (state, z, u, k), as it would be compiled."""
+    state, z, u, k = arguments
+    return filter.step(state, z, u, k)
+
+
+def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
+    """Yield each fusion between neighbours whose step is too long to be written out."""
+    for name, fusion in network.meshes.items():
+        nodes = len(network.mesh_nodes(name))
+        if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).has_long_step:
+            yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
+
+
+def _join_first_names(names: list[str]) -> str:
+    """Return names in words, the first SHOWN of many and how many more there are."""
+    more = len(names) - SHOWN
+    return f"{', '.join(names[:SHOWN])} and {more} more" if more > 0 else join_names(names)

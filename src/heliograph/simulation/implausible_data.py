@@ -1,0 +1,277 @@
+"""Steps of all filters without implausible data, messages about them, and values that a sender's rule forbids."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import INPUT, Judgement
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
+from heliograph.model.over_time import first
+from heliograph.model.trigger import AbstractThreshold
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.centres.uplinks import UplinkDraws
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network_filters import AllFilters
+from heliograph.simulation.network_index import EstimatePlace
+from heliograph.simulation.node import Node, ReceivingNode
+
+Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
+
+RIM = 1e-9  # share of delta by which a value may lie inside for rounding
+
+
+def is_implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
+    """Return, within a program, whether some filter judges its measurement implausible; `outputs` of a step."""
+    flags = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
+    return jnp.any(jnp.stack(flags)) if flags else jnp.asarray(False)
+
+
+def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
+    """Return whether some filter judged a measurement implausible, in stored `outputs` of many rows (NumPy arrays)."""
+    return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
+
+
+def read_refusal_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+    """Return each filter's reason not to use its measurement, 0 for none: of nodes by kind, of central ones by name."""
+    by_kind = [judgement.reason for judgement in outputs["judged"]]
+    return by_kind, {name: judgement.reason for name, judgement in outputs["judged_centrally"].items()}
+
+
+# Traced once, for the shapes of its results and for the loop's body: tracing is most of what a step takes to compile.
+_step_filters: Callable[..., Stepped] = eqx.filter_jit(AllFilters.step, inline=True)  # type: ignore[call-overload]
+
+
+def step_plausibly(
+    filters: AllFilters,
+    states: PyTree,
+    z: Sequence[jax.Array],
+    u: jax.Array,
+    k: jax.Array,
+    drawn: Mapping[str, UplinkDraws] | None = None,
+) -> Stepped:
+    """Step all filters with all data, which they judge; where some is implausible, step again without it.
+
+    In the second turn each filter skips what it judged implausible in the first; the judgements of the first stay. A
+    loop of at most two turns, so that the second is left out where it is not needed.
+
+    Args:
+        filters: of the network.
+        states: before the step.
+        z: measurements (node, received) by group.
+        u: inputs of the plant over the step.
+        k: number of the step.
+        drawn: what uplinks and links between neighbours do, by fusion; without, nothing is lost.
+
+    Returns:
+        The states after the step, and its outputs, as of `AllFilters.step`.
+    """
+    # The loop begins with outputs of zeros, in which nothing is implausible; their shapes are those of a step's.
+    by_kind = [jnp.zeros((stacked.count, stacked.nodes)) for stacked in filters.alike]
+    none_skipped = by_kind, {name: jnp.zeros(()) for name in filters.central}
+    _, output_shapes = eqx.filter_eval_shape(_step_filters, filters, states, z, u, k, drawn, none_skipped)
+
+    def needs_turn(carry: tuple[jax.Array, Stepped]) -> jax.Array:
+        """Return whether to step: in turn 0 always, in turn 1 where something was implausible."""
+        turn, (_, outputs) = carry
+        return (turn == 0) | (turn == 1) & is_implausible(outputs)
+
+    def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
+        """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
+        turn, (_, before) = carry
+        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_refusal_reasons(before))
+        # The first turn judges all data, the second what is left of them: the first's judgements stay.
+        for name in ("judged", "judged_centrally"):
+            outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
+        return turn + 1, (after, outputs)
+
+    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), output_shapes)
+    stepped: Stepped
+    _, stepped = jax.lax.while_loop(needs_turn, step, (jnp.asarray(0), (states, start)))
+    return stepped
+
+
+class JudgementReader:
+    """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
+
+    def __init__(self, network: Network):
+        """Find, for each node, the places of its filters that receive measurements."""
+        self._places: dict[str, list[EstimatePlace]] = {name: [] for name in network.names}
+        for (node, name), place in network.places.items():
+            if network.nodes[node].filters[name].received:
+                self._places[node].append(place)
+
+    def read_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
+        """Return the judgements of the filters that receive from a node; where it has none, of the central ones."""
+        return self._stack_judgements(outputs, self._places[node], not self._places[node])
+
+    def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
+        """Return the judgements of all filters, those of the nodes by kind and then central ones."""
+        places = []
+        for kind, judgement in enumerate(outputs["judged"]):
+            filters, nodes = judgement.distance.shape[-2:]
+            places += [EstimatePlace(kind, f, i) for f, i in np.ndindex(filters, nodes)]
+        return self._stack_judgements(outputs, places, central=True)
+
+    def _stack_judgements(
+        self, outputs: Mapping[str, PyTree], places: Sequence[EstimatePlace], central: bool
+    ) -> Float[np.ndarray, "... filters 4"]:
+        """Return the judgements of these filters, and those of the centre behind them if `central`.
+
+        Axes: the recording's, filter, field of a Judgement.
+        """
+        judgements = [
+            [field[..., place.filter, place.node] for field in outputs["judged"][place.kind]] for place in places
+        ]
+        judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
+        if not judgements:
+            return np.zeros((0, len(Judgement._fields)))
+        return np.moveaxis(np.array(judgements), (0, 1), (-2, -1))
+
+    @property
+    def without_own(self) -> list[str]:
+        """Nodes that no filter of their own judges, but the central ones."""
+        return [name for name, places in self._places.items() if not places]
+
+
+def find_refused_rows(
+    network: Network, outcome: Mapping[str, PyTree]
+) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
+    """Return the rows whose values all filters of a node refuse, with the reason: by node, and of the central filters.
+
+    Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
+    what filtering the rows with judgements put out.
+    """
+    judges, refused = JudgementReader(network), dict[str, dict[int, str]]()
+    without_own = judges.without_own
+    for name in network.names:
+        if name not in without_own and (reasons_by_row := _list_rows_refused_by_all(judges.read_node(outcome, name))):
+            refused[name] = reasons_by_row
+    central = _list_rows_refused_by_all(judges.read_node(outcome, without_own[0])) if without_own else {}
+    return refused, central
+
+
+def _list_rows_refused_by_all(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
+    """Return the rows whose values all these filters refuse, with the reason."""
+    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in _find_flagged(votes, "reason")}
+    return {row: reason for row, reason in reasons_by_row.items() if reason}
+
+
+def describe_doubts(
+    network: Network,
+    outputs: Mapping[str, PyTree],
+    refused: Mapping[str, Mapping[int, str]],
+    u: Float[np.ndarray, "steps inputs"],
+) -> list[str]:
+    """Return messages about a recording: rows that are implausible to all filters or to one alone, and inputs.
+
+    Args:
+        network: the network.
+        outputs: of filtering the rows with judgements, by row.
+        refused: rows that all filters of a node refuse, by node, with the reason.
+        u: inputs of the plant.
+    """
+    # Rows that are implausible for all filters of a node; the first is explained, by a function's fault if any has one.
+    faults = _NonFiniteFunctionFinder(network, outputs, u)
+    lines = []
+    for node, by_row in refused.items():
+        first_row, why = next(iter(by_row.items()))
+        named = [faults.name_fault(node, name, first_row) for name in network.nodes[node].filters]
+        fault = next((words for words in named if words), "")
+        lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
+    # Rows that a single filter skips, those of above aside. Of the judgements of a kind one filter's at one node.
+    judgements = {
+        place: Judgement(*(field[:, at.filter, at.node] for field in outputs["judged"][at.kind]))
+        for place, at in network.places.items()
+    }
+    judgements |= {(FUSED, name): judgement for name, judgement in outputs["judged_centrally"].items()}
+    all_rows = {k: "" for rows in refused.values() for k in rows}
+    for (node, name), judgement in judgements.items():
+        reported = all_rows if node == FUSED else refused.get(node, {})
+        rows = [int(k) for k in np.flatnonzero(judgement.reason > 0) if k not in reported]
+        if rows:
+            reason, distance = np.asarray(judgement.reason)[rows[0]], np.asarray(judgement.distance)[rows[0]]
+            why = Judgement.describe(reason, distance) + faults.name_fault(node, name, rows[0])
+            lines.append(f"filter {name!r} of {node!r} alone: {_format_rows(rows)} implausible, left out: {why}")
+    # Inputs, judged by all filters.
+    if network.inputs:
+        votes = JudgementReader(network).read_all(outputs)
+        rows = [k for k in _find_flagged(votes, "input") if Judgement.why_inputs(votes[k])]
+        if rows:
+            lines.append(f"inputs: {_format_rows(rows)} implausible: {INPUT}")
+    return lines
+
+
+class _NonFiniteFunctionFinder:
+    """Names functions of the filters' models that returned no number in a recording."""
+
+    def __init__(self, network: Network, outputs: Mapping[str, PyTree], u: Float[np.ndarray, "steps inputs"]):
+        """Hold the network, what its filters put out by row, and the inputs of the plant."""
+        self.network, self.u = network, u
+        self.outputs = outputs.get("filtered", outputs)  # those of filters, where smoothed ones stand beside them
+
+    def name_fault(self, node: str, name: str, row: int) -> str:
+        """Return "; " and what function of a filter returned no number in a row; "" where none did.
+
+        `node`: where the filter `name` stands, FUSED for a central one.
+        """
+        central = node == FUSED
+        filter = self.network.fused[name] if central else self.network.nodes[node].filters[name]
+        if not isinstance(filter, AbstractFilter):
+            return ""
+        if row == 0:
+            before = filter.estimate(filter.init())
+        elif central:
+            before = jax.tree.map(lambda leaf: leaf[row - 1], self.outputs["fused"][name])
+        else:
+            at = self.network.places[node, name]
+            before = jax.tree.map(lambda leaf: leaf[row - 1, at.filter, at.node], self.outputs["estimates"][at.kind])
+        fault = describe_non_finite_function(filter, before, self.u[row], row)
+        return f"; {fault}" if fault else ""
+
+
+def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
+    """Return the rows in which this field of some filter's judgement is over 0."""
+    if not votes.size:
+        return []
+    flagged: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
+    return flagged
+
+
+def _format_rows(rows: Sequence[int]) -> str:
+    """Return "row 3 is", or "7 rows (1, 2, ...) are" with the first five, counted from 1."""
+    listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"
+
+
+def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+    """Return the rows at which a value came though it was within delta of the value before, and no heartbeat was due.
+
+    Only of a sender on delta whose values all arrive as they are: elsewhere no single value is impossible. A filter
+    uses such a value and gives it a floor of 1e-6 as its probability.
+    """
+    trigger = node.trigger if isinstance(node, Node) else None
+    if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
+        return []
+    assert isinstance(node, Node)  # as it has a trigger
+    channel = first(node.channel)
+    is_as_sent = not channel.erases and not channel.remembers and channel.outputs == len(node.outputs)
+    if not is_as_sent:
+        return []
+    # Each row that came whole against the one before it, `last`.
+    forbidden, last = list[int](), None
+    for k, row in enumerate(z[:, : len(node.outputs)]):
+        if np.isnan(row).any():
+            continue
+        if last is not None:
+            heartbeat_is_due = trigger.heartbeat is not None and k - last >= trigger.heartbeat
+            change = np.abs(row - z[last, : len(row)])
+            delta = (1 - RIM) * np.asarray(trigger.delta)
+            is_inside = np.linalg.norm(change) <= delta if trigger.region == "ball" else np.all(change <= delta)
+            if is_inside and not heartbeat_is_due:
+                forbidden.append(k)
+        last = k
+    return forbidden

@@ -1,0 +1,388 @@
+"""One step of a whole network's filters, under the scan over time."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.precomputed_filter import LinearStep
+from heliograph.filters.smoother_step import gaussian_of
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import fail, instance, text
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.centres.fused_innovation import FusedInnovation, following_prior, make_fused_innovations
+from heliograph.simulation.centres.fusion_centre import (
+    CentreFilter,
+    CentreState,
+    FusionCentre,
+)
+from heliograph.simulation.centres.fusions import (
+    ReportFusion,
+    StackedFusions,
+    build_centre_filter,
+    build_report_fusions,
+    list_centres,
+    list_stacked_fusions,
+)
+from heliograph.simulation.centres.linearised_centre import LinearisedCentre, LinearisedFusionState
+from heliograph.simulation.centres.mesh import Mesh
+from heliograph.simulation.centres.mesh_building import build_meshes
+from heliograph.simulation.network import Network
+from heliograph.simulation.network_index import find_measurement_order
+from heliograph.simulation.runs.stacked_filters import (
+    StackedFilters,
+    StepOutput,
+    filter_step,
+    initial_state,
+    stack_by_kind,
+)
+
+
+class AllFilters(Module):
+    """Every filter of a network: those of the nodes by kind, fusion rules, informed centres, central filters.
+
+    A group holds the nodes that differ in numbers alone; a kind holds, of one group, the filters that differ so.
+
+    Fields:
+        alike: the nodes' filters, those of a kind stacked.
+        fusions: of the nodes' estimates by rules that know nothing of the nodes.
+        centres: of the informed fusions, which know how the nodes' errors are correlated; one for each filter fused so.
+        reporting: fusions by reports over uplinks, by name.
+        meshes: fusions between neighbours, by name.
+        tests: of fused estimates by what arrives after them, by name.
+        central: filters of all nodes' measurements at once, by name.
+        order: brings the groups' measurements, joined, into the order of the nodes; None where they are in it.
+        complete: of each group, whether nothing of its measurements is ever missing.
+        n: number of the plant's states.
+        smooths: central filters return smoother steps, as do those of the kinds that do.
+        judges: filters judge their data.
+    """
+
+    alike: tuple[StackedFilters, ...]
+    fusions: tuple[StackedFusions, ...]
+    centres: tuple[FusionCentre | LinearisedCentre, ...]
+    reporting: dict[str, ReportFusion]
+    meshes: dict[str, Mesh]
+    tests: dict[str, FusedInnovation]
+    central: dict[str, AbstractFilter]
+    order: np.ndarray | None
+    complete: tuple[bool, ...] = eqx.field(static=True)
+    n: int = eqx.field(static=True)
+    smooths: bool = eqx.field(static=True)
+    judges: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        network: Network,
+        smoothed_kinds: Collection[int] | None = None,
+        judges: bool = False,
+        tests: bool = False,
+    ):
+        """Stack the filters of a network by kind, and build its fusions.
+
+        Args:
+            network: the network.
+            smoothed_kinds: numbers of the kinds of filters to be smoothed, with all central filters; None if nothing
+                is.
+            judges: filters judge their data, and skip implausible data on request.
+            tests: fused estimates are tested by what arrives at the next step.
+        """
+        self.smooths, self.judges = smoothed_kinds is not None, judges
+        self.alike = stack_by_kind(network, smoothed_kinds or (), judges)
+        # At the centre: filters of all measurements, fusions of estimates, and those that know or receive more.
+        self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
+        self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
+        self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
+        self.tests = make_fused_innovations(network, self.alike) if tests else {}
+        self.order = find_measurement_order(network.groups, network.rows)
+        self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
+        self.n = len(network.states)
+
+    def init(self) -> PyTree:
+        """Return the states before the first step.
+
+        A tuple: of the nodes' filters by kind; of central filters by name; of quantizers, by stack of fusions; of the
+        informed centres; of fusions by reports and between neighbours by name; and the fused estimates to be tested.
+        """
+        central = {name: initial_state(filter) for name, filter in self.central.items()}
+        states = tuple(stacked.init() for stacked in self.alike)
+        quantizers = tuple(fusion.init(self.n) for fusion in self.fusions)
+        exchanges: dict[str, PyTree] = {name: fusion.init() for name, fusion in self.reporting.items()}
+        exchanges |= {name: mesh.init() for name, mesh in self.meshes.items()}
+        tested = {name: test.start for name, test in self.tests.items()}
+        centres = tuple(self._init_centre(centre, states) for centre in self.centres)
+        return states, central, quantizers, centres, exchanges, tested
+
+    def _init_centre(
+        self, centre: FusionCentre | LinearisedCentre, states: Sequence[PyTree]
+    ) -> CentreState | dict[str, LinearisedFusionState]:
+        """Return a centre's state before the first step, from the first means of the filters whose estimates it fuses.
+
+        `states`: of the nodes' filters by kind. Means of one kind are (filter and node, n), filter after filter.
+        """
+        means = []
+        for kind, f in centre.sources:
+            by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
+            means.append(by_filter[f])
+        return centre.init(means)
+
+    @property
+    def are_linear_and_unfused(self) -> bool:
+        """Whether no filter's gain depends on data, and nothing is fused."""
+        filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
+        fuses = self.fusions or self.centres or self.reporting or self.meshes
+        return not fuses and all(filter.is_linear for filter in filters)
+
+    @property
+    def linear_centres(self) -> tuple[FusionCentre, ...]:
+        """Informed centres of filters whose gains do not depend on data."""
+        return tuple(centre for centre in self.centres if isinstance(centre, FusionCentre))
+
+    def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
+        """Return the matrices of step k of the filters that a centre fuses, for each of its sources.
+
+        `states`: of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so that
+        measurements of zero do.
+        """
+        matrices = []
+        for kind, f in centre.sources:
+            alike, zeros = self.alike[kind], self._make_zeros(kind)
+            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, zeros, u, k))
+        return matrices
+
+    def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """Return the states of the nodes' filters by kind after step k, for measurements of zero."""
+        kinds = enumerate(zip(self.alike, states, strict=True))
+        return tuple(alike.step(state, self._make_zeros(kind), u, k)[0] for kind, (alike, state) in kinds)
+
+    def _make_zeros(self, kind: int) -> jax.Array:
+        """Return measurements (node, received) of zero for the nodes of a kind."""
+        return jnp.zeros((self.alike[kind].nodes, self.alike[kind].filters.received))
+
+    def step(
+        self,
+        states: PyTree,
+        z: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+        drawn: Mapping[str, PyTree] | None = None,
+        skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
+    ) -> tuple[PyTree, dict[str, PyTree]]:
+        """Step all filters and fusions of the network over step k.
+
+        Args:
+            states: of all filters and fusions before the step, as `init` returns them.
+            z: measurements (node, received) by group of nodes, NaN where one is missing.
+            u: inputs of the plant over the step.
+            k: number of the step.
+            drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
+            skip: reasons not to use data, codes of `Reason`: (filter, node) by kind, and by name of central filters.
+
+        Returns:
+            The states after the step, and its outputs: "estimates" by kind, (filter, node, ...), then those between
+            neighbours; "fused" by name; "uplinks" of fusions with quantizers, and "reports" with their delays by
+            fusion, as the nodes send them; where filters smooth, their "smoother_steps" by kind and "central_steps" by
+            name; where they judge, "judged" and "weighed" by kind, "judged_centrally" and "weighed_centrally" by name,
+            and "tested", the squared innovations of fused estimates by name.
+        """
+        filter_states, central, quantizer_states, centre_states, exchange_states, tested = states
+        reasons: Sequence[jax.Array | None] = [None] * len(filter_states)
+        central_reasons: Mapping[str, jax.Array] = {}
+        if skip is not None:
+            reasons, central_reasons = skip
+        # The nodes' filters, and central ones on all measurements in the order of the nodes.
+        stepped = [
+            stacked.step(state, z[stacked.group], u, k, reason)
+            for stacked, state, reason in zip(self.alike, filter_states, reasons, strict=True)
+        ]
+        stepped_centrally = self._step_central_filters(central, z, u, k, central_reasons)
+        # Fusions of the nodes' estimates.
+        estimates = tuple(output.estimate for _, output in stepped)
+        following, of_fusions = self._step_fusions(
+            (filter_states, quantizer_states, centre_states, exchange_states), z, estimates, u, k, drawn or {}
+        )
+        fused_centrally = {name: output.estimate for name, (_, output) in stepped_centrally.items()}
+        fused = fused_centrally | of_fusions.fused
+        outputs: dict[str, PyTree] = {
+            "estimates": (*estimates, *of_fusions.between_neighbours),
+            "fused": fused,
+            "uplinks": of_fusions.uplinks,
+            "reports": of_fusions.reports,
+        }
+        # What arrived now tests the fused estimates of the last step; those of this step are tested at the next.
+        distances = {
+            name: test.step(tested[name], self.alike, filter_states, z, u, k, reasons)
+            for name, test in self.tests.items()
+        }
+        tested_next = {name: following_prior(fused[name]) for name in self.tests}
+        if self.judges:
+            outputs["tested"] = distances
+        # What else the filters' steps put out, under one name of the nodes' filters and another of central ones.
+        for field, of_nodes, centrally in self._list_details():
+            outputs[of_nodes] = tuple(getattr(output, field) for _, output in stepped)
+            outputs[centrally] = {name: getattr(output, field) for name, (_, output) in stepped_centrally.items()}
+        central_after = {name: state for name, (state, _) in stepped_centrally.items()}
+        return (tuple(state for state, _ in stepped), central_after, *following, tested_next), outputs
+
+    def _step_central_filters(
+        self,
+        states: Mapping[str, PyTree],
+        z: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+        skip: Mapping[str, jax.Array],
+    ) -> dict[str, tuple[PyTree, StepOutput]]:
+        """Return the next state and the output of each central filter, by name, on the measurements of all groups.
+
+        Arguments as of `step`; `states` and `skip` by name of the filter.
+        """
+        joined = jnp.concatenate([jnp.ravel(values) for values in z])
+        joined = joined if self.order is None else joined[self.order]
+        return {
+            name: filter_step(filter, states[name], joined, u, k, self.smooths, self.judges, skip.get(name))
+            for name, filter in self.central.items()
+        }
+
+    def _list_details(self) -> list[tuple[str, str, str]]:
+        """Return (field of `StepOutput`, its name among the nodes' outputs, and among central filters') to put out."""
+        judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
+        steps = [("steps", "smoother_steps", "central_steps")]
+        return (steps if self.smooths else []) + (judged if self.judges else [])
+
+    def _step_fusions(
+        self,
+        states: tuple[PyTree, ...],
+        z: Sequence[jax.Array],
+        estimates: tuple[Estimate, ...],
+        u: jax.Array,
+        k: jax.Array,
+        drawn: Mapping[str, PyTree],
+    ) -> tuple[tuple[PyTree, ...], "FusionOutputs"]:
+        """Step all fusions with the estimates of the nodes' filters of this step.
+
+        Args:
+            states: before the step, of the nodes' filters, quantizers, informed centres and exchanges of messages.
+            z: measurements (node, received) by group of nodes.
+            estimates: of the nodes' filters by kind, (filter, node, ...).
+            u: inputs of the plant over the step.
+            k: number of the step.
+            drawn: what the uplinks and the links between neighbours do, by fusion; without, nothing is lost.
+
+        Returns:
+            The states after the step of quantizers, centres and exchanges, and what the fusions put out.
+        """
+        filter_states, quantizer_states, centre_states, exchange_states = states
+        fused, uplinks, reports, exchanges_after = (dict[str, PyTree]() for _ in range(4))
+        # Rules that know nothing of the nodes, on estimates through the nodes' quantizers.
+        quantizers_after, centres_after = list[PyTree](), list[PyTree]()
+        for fusion, state in zip(self.fusions, quantizer_states, strict=True):
+            following, outcome, traffic = fusion.step(state, estimates, k)
+            quantizers_after.append(following)
+            fused |= outcome
+            uplinks |= traffic
+        # Informed centres, which propagate the joint moments of the errors.
+        for centre, state in zip(self.centres, centre_states, strict=True):
+            following, outcome = self._step_centre(centre, state, filter_states, z, estimates, u, k)
+            centres_after.append(following)
+            fused |= outcome
+        # Centres with reports over uplinks.
+        for name, by_report in self.reporting.items():
+            draws = drawn[name] if name in drawn else by_report.uplinks.lossless()
+            exchanges_after[name], fused[name], traffic, reports[name] = by_report.step(
+                exchange_states[name], estimates, draws, u, k
+            )
+            uplinks |= {name: traffic} if traffic else {}
+        # Fusions between neighbours, which have an estimate at each node.
+        between_neighbours = list[Estimate]()
+        for name, mesh in sorted(self.meshes.items()):
+            # What is drawn: flags of what arrives, or a pair of these and of weights that were computed before.
+            arrivals = drawn[name] if name in drawn else mesh.edges.lossless()
+            flags, ahead = arrivals if isinstance(arrivals, tuple) else (arrivals, ())
+            exchanges_after[name], of_mesh = mesh.step(exchange_states[name], z, jnp.asarray(flags), u, k, ahead)
+            between_neighbours.extend(of_mesh)
+            reports[name] = flags, jnp.zeros(())  # no delays beside the flags, which hold them where there are any
+        outputs = FusionOutputs(tuple(between_neighbours), fused, uplinks, reports)
+        return (tuple(quantizers_after), tuple(centres_after), exchanges_after), outputs
+
+    def _step_centre(
+        self,
+        centre: FusionCentre | LinearisedCentre,
+        state: PyTree,
+        states: PyTree,
+        z: Sequence[jax.Array],
+        estimates: Sequence[Estimate],
+        u: jax.Array,
+        k: jax.Array,
+    ) -> tuple[PyTree, dict[str, Estimate]]:
+        """Return an informed centre's next state, and its fused estimates by name.
+
+        Args:
+            centre: the centre.
+            state: its state before the step.
+            states: of the nodes' filters by kind before the step, from which the matrices of their steps follow.
+            z: measurements (node, received) by group of nodes.
+            estimates: of the nodes' filters by kind after the step, (filter, node, ...).
+            u: inputs of the plant over the step.
+            k: number of the step.
+        """
+        matrices = []
+        for kind, f in centre.sources:
+            alike = self.alike[kind]
+            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, z[alike.group], u, k))
+        means = [jnp.asarray(estimates[kind].mean)[f] for kind, f in centre.sources]
+        return centre.step(state, matrices, means, u, k)
+
+
+class FusionOutputs(NamedTuple):
+    """What the fusions of a network put out at a step; each is empty where there is none of its kind.
+
+    Args:
+        between_neighbours: estimates (1, node, ...) by group of nodes, of each such fusion in the order of their names.
+        fused: estimates of all others, by name.
+        uplinks: what the nodes' quantizers sent, by name.
+        reports: which reports arrived and their delays, by name.
+    """
+
+    between_neighbours: tuple[Estimate, ...]
+    fused: dict[str, PyTree]
+    uplinks: dict[str, PyTree]
+    reports: dict[str, PyTree]
+
+
+@compile_on_call
+def initial_states(filters: AllFilters) -> PyTree:
+    """Return the states before the first step, computed by one program instead of one for each operation."""
+    return jax.tree.map(jnp.asarray, filters.init())
+
+
+def centre_filter(network: Network, name: str) -> CentreFilter:
+    """Return the filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on nodes' reports.
+
+    The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
+    that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by
+    the bound on its error. Claim: as the fusion's.
+
+    Args:
+        network: the network.
+        name: of its fusion.
+
+    Raises:
+        ValueError: no fusion of this name, or one by another rule; nodes that lose measurements, since their reports
+            do not say which arrived.
+
+    Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
+    """
+    instance("network", network, Network, "a Network")
+    text("fusion", name)
+    fusion = network.fused.get(name)
+    if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
+        by_reports = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
+        raise fail("fusion", f"one of {by_reports}, which receive reports", repr(name))
+    return build_centre_filter(network, name, fusion, AllFilters)

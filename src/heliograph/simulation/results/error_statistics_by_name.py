@@ -1,0 +1,233 @@
+"""Error statistics by node and filter."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import units_in
+from heliograph.simulation.network import FUSED
+from heliograph.simulation.results.labelled_datasets import (
+    TIME,
+    FilterLabels,
+    check_title,
+    iterate_filters,
+    read_labels,
+    read_units,
+    read_uplinks,
+    read_values,
+)
+from heliograph.simulation.results.plots import (
+    FAR,
+    choose_colour,
+    choose_filters,
+    find_state_places,
+    legend_outside,
+    make_panels,
+)
+from heliograph.simulation.results.saved_datasets import SavableResults
+from heliograph.simulation.results.statistics import ErrorStatistics, expand_pairs
+
+if TYPE_CHECKING:  # extras
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
+
+
+@readable
+class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
+    """Error statistics by node and filter; fused ones under "fused".
+
+    `smoothed` holds statistics of estimates given later data too, None where these were not asked for. They are saved
+    separately.
+
+    Args:
+        by_node: statistics by node and filter.
+        states: names of the plant's states.
+        units: by the state's name; by default those that the names have.
+    """
+
+    def __init__(
+        self,
+        by_node: Mapping[str, dict[str, ErrorStatistics]],
+        states: tuple[str, ...],
+        units: Mapping[str, str] | None = None,
+    ):
+        super().__init__(by_node)
+        self.states, self.units = states, units_in(states) | dict(units or {})
+        self.smoothed: StatisticsByName | None = None
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Return the labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
+
+        Raises:
+            ModuleNotFoundError: without xarray (extra "results").
+        """
+        first = next((score for filters in self.values() for score in filters.values()), None)
+        if first is None:
+            raise fail("statistics", "those of one filter at least", "none")
+        n, steps = len(self.states), first.nees.shape[1]
+        labels = FilterLabels(
+            nodes=list(self),
+            by_node=self,
+            states=self.states,
+            rows={TIME: steps},
+            lengths={"batch": len(first.count)},
+            uplinks={name: score.uplink for name, score in self.get(FUSED, {}).items() if score.uplink},
+        )
+
+        def take_variances(covariances: np.ndarray) -> np.ndarray:
+            """Return the diagonals (..., n) of covariances (..., n, n)."""
+            return np.diagonal(covariances, axis1=-2, axis2=-1)
+
+        # fill(name, read): the array of the field `name`, of what `read` returns of each filter's statistics.
+        fill, none_failed = labels.fill_from_results, np.full(steps, np.nan)
+        claimed = fill("deviation", lambda score: take_variances(score.claimed()))
+        fields = {
+            # Sums by batch, from which the statistics can be restored.
+            "runs": first.count,
+            "errors": fill("errors", lambda score: expand_pairs(score.pairs)),
+            "claimed": fill("claimed", lambda score: expand_pairs(score.claimed_pairs)),
+            "nees": fill("nees", lambda score: score.nees),
+            "claim": labels.claims(),
+            "failed": fill("failed", lambda score: none_failed if score.failed is None else score.failed),
+            "failed_runs": fill("failed_runs", lambda score: score.failed_runs),
+            # Figures made from these; of a claimed variance that is negative there is no deviation.
+            "rmse": np.sqrt(fill("rmse", lambda score: take_variances(score.actual()))),
+            "deviation": np.sqrt(np.where(claimed >= 0, claimed, np.nan)),
+            "nees_per_dimension": fill("nees_per_dimension", lambda score: score.nees.sum(axis=0) / score.runs / n),
+            **labels.make_quantizer_fields(),
+        }
+        return labels.make_dataset(STATISTICS, fields, np.arange(1.0, steps + 1), self.units)
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
+        """Return the statistics from a dataset that `to_xarray` made.
+
+        Raises:
+            ValueError: no such dataset.
+        """
+        check_title(dataset, STATISTICS)
+        states, count = read_labels(dataset, "state"), read_values(dataset, "runs", [TIME])
+        upper, uplinks = np.triu_indices(len(states)), read_uplinks(dataset, [TIME])
+        # Back to nodes and filters by name; of symmetric matrices the pairs i <= j.
+        results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in read_labels(dataset, "node")}
+        sums = ("errors", "claimed", "nees", "failed", "failed_runs")
+        for node, name, claim, values in iterate_filters(dataset, sums, [TIME]):
+            results[node][name] = ErrorStatistics(
+                count=count.copy(),
+                pairs=values["errors"][..., *upper],
+                claimed_pairs=values["claimed"][..., *upper],
+                nees=values["nees"],
+                claim=claim,
+                uplink=uplinks.get(name) if node == FUSED else None,
+                failed=None if np.isnan(values["failed"]).any() else values["failed"],
+                failed_runs=int(values["failed_runs"]),
+            )
+        return cls(results, tuple(states), read_units(dataset))
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the table: a row for each node and filter, with claim, runs, RMSE, NEES, errors, and figures by state.
+
+        Raises:
+            ModuleNotFoundError: without pandas (extra "results").
+        """
+        import pandas as pd
+
+        rows, index = [], []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of failed runs: the row says how many
+            for node, filters in self.items():
+                for name, score in filters.items():
+                    index.append((node, name))
+                    rows.append(_list_figures(score, self.states))
+        names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
+        return pd.DataFrame(rows, index=names)
+
+    def plot(
+        self,
+        node: str | None = None,
+        filters: Sequence[str] | None = None,
+        states: Sequence[str] | None = None,
+        axes: "Axes | Sequence[Axes] | None" = None,
+    ) -> "list[Axes]":
+        """Draw the RMSE over time, and dashed the claimed deviation: one axes a state.
+
+        Args:
+            node: name of the node; the first by default.
+            filters: names of its filters; all by default.
+            states: names of states; all by default.
+            axes: to draw on, as many as states; new ones by default.
+
+        Raises:
+            ValueError: a node, filter or state that there is not, another number of axes.
+            ModuleNotFoundError: without matplotlib (extra "report").
+        """
+        # What is drawn, on which axes.
+        node, filters = choose_filters(self, node, filters)
+        places = find_state_places(states, self.states)
+        time = np.arange(1.0, self[node][filters[0]].nees.shape[1] + 1)
+        drawn = make_panels(axes, len(places), time, self.units)
+        for panel, i in zip(drawn, places, strict=True):
+            for number, name in enumerate(filters):
+                # Solid: actual; dashed: claimed.
+                score, colour = self[node][name], choose_colour(number)
+                claimed = score.claimed()[:, i, i]
+                panel.plot(time, np.sqrt(score.actual()[:, i, i]), color=colour, label=quote_for_figure(name))
+                panel.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+            panel.set_ylabel(f"RMSE of {label_with_unit(self.states[i], self.units)}")
+            # A log axis where one is far larger than another.
+            ends = [float(np.sqrt(self[node][name].actual()[-1, i, i])) for name in filters]
+            if min(ends) > 0 and np.isfinite(max(ends)) and max(ends) > FAR * min(ends):
+                panel.set_yscale("log")
+        legend_outside(drawn[0], "dashed: claimed")
+        return drawn
+
+    def failures(self) -> list[str]:
+        """Return a line for each filter without a valid estimate in some run, and for each uplink that saturated.
+
+        Those of smoothed estimates come first and begin with "smoothed".
+        """
+        lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
+        for node, filters in self.items():
+            lines += [f"{node}/{name}: {score.failure}" for name, score in filters.items() if score.failed_runs]
+            for name, score in filters.items():
+                shares = score.uplink.saturated_share() if score.uplink else {}
+                for sender, share in shares.items():
+                    if share:
+                        lines.append(
+                            f"{node}/{name}: the quantizer of node {sender} saturated in {share:.2%} of samples"
+                        )
+        return lines
+
+
+def _list_figures(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+    """Return a filter's figures by name: RMSE, NEES with its interval, and RMSE and claim of each state."""
+    nees, low, high = score.nees_per_dimension()
+    rmse, error = score.rmse()
+    # All states together.
+    figures = {
+        "claim": "none" if score.failed_runs else score.claim,
+        "runs": score.runs,
+        "failed runs": score.failed_runs,
+        "rmse": rmse,
+        "rmse error": error,
+        "nees": nees,
+        "nees low": low,
+        "nees high": high,
+    }
+    # Each state.
+    by_state = zip(states, *score.rmse_by_state(), score.deviation_by_state(), strict=True)
+    for state, rmse_of_state, error_of_state, claimed in by_state:
+        figures |= {
+            f"rmse of {state}": rmse_of_state,
+            f"rmse error of {state}": error_of_state,
+            f"claimed of {state}": claimed,
+        }
+    return figures

@@ -1,0 +1,131 @@
+"""Results by names of nodes and filters, from arrays whose axes are groups of nodes and kinds of filters."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.filters.innovation import Weighed
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.centres.uplinks import SentReports, Uplink
+from heliograph.simulation.network import FUSED, Network
+
+
+def reports_by_name(
+    network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> dict[str, dict[str, SentReports]]:
+    """Return the reports by fusion and node, without a node's padding.
+
+    `outcome`: by fusion, what was sent (..., node, m) and its delays (..., node); between neighbours what arrived.
+    """
+    reports: dict[str, dict[str, SentReports]] = {}
+    for name, (values, delay) in outcome.items():
+        if name in network.meshes:
+            reports[name] = _name_arrivals(network, name, np.asarray(values))
+            continue
+        fusion = network.fused[name]
+        assert isinstance(fusion, Fusion)  # no other rule uses reports
+        nodes, n = network.nodes_with(fusion.filter), len(network.states)
+        sizes = [link.received(n) for link in fusion.links(nodes)]
+        reports[name] = {
+            node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
+            for i, node in enumerate(nodes)
+        }
+    return reports
+
+
+def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
+    """Return by node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost."""
+    neighbours = network.meshes[name].neighbours or {}
+    reports = {}
+    for i, node in enumerate(network.mesh_nodes(name)):
+        if count := len(neighbours[node]):
+            flags = arrived[..., i, :, 1 : count + 1]  # without the node's own message, and without padding
+            ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
+            values = ages.reshape(*flags.shape[:-2], -1)
+            reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
+    return reports
+
+
+def split_measurements(
+    network: Network, groups: Sequence[Float[np.ndarray, "*runs node received"]]
+) -> dict[str, np.ndarray]:
+    """Split measurements of the groups of nodes (..., node, received) by node, in the order of the network.
+
+    Args:
+        network: the network, whose `groups` are the nodes of each.
+        groups: measurements of each group, as a reducer collects them.
+    """
+    received = {
+        name: np.asarray(z)[..., i, :]
+        for names, z in zip(network.groups, groups, strict=True)
+        for i, name in enumerate(names)
+    }
+    return {name: received[name] for name in network.names}
+
+
+def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    return {
+        name: np.asarray(node_group)[..., i, :]
+        for group, node_group in groups.items()
+        for i, name in enumerate(network.groups[int(group)])
+    }
+
+
+def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
+    """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter."""
+    parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
+    modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
+    for name, place in network.places.items():
+        # Of nodes' filters (..., filter, node, M), where the batch has estimates of their kind.
+        if place.kind < len(parts) and parts[place.kind].modes is not None:
+            modes[name] = np.asarray(parts[place.kind].modes)[..., place.filter, place.node, :]
+    return modes
+
+
+def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
+    """Return the innovations of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
+    parts = batch.get("weighed", ())
+    weighed: dict[str, dict[str, Weighed]] = {}
+    for (node, name), place in network.places.items() if parts else ():
+        if parts[place.kind] is not None:
+            fields = [np.asarray(field)[:, place.filter, place.node] for field in parts[place.kind]]
+            weighed.setdefault(node, {})[name] = Weighed(*fields)
+    central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
+    return weighed | ({FUSED: central} if central else {})
+
+
+def split_by_name(
+    network: Network, batch: PyTree, read: Callable[[PyTree], Any], axis: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """Split what is collected of estimates by node and filter, at its axes (filter, node), the first of them at `axis`.
+
+    Args:
+        network: the network, whose `kinds` are the filters of each.
+        batch: "estimates" by kind, and "fused" by name, which has not these two axes.
+        read: gives the array of an entry of `batch`.
+        axis: of the filters in that array; the nodes' follows it.
+    """
+    by_node: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
+    parts = batch["estimates"]
+    kinds = (network.kinds + network.mesh_kinds)[: len(parts)]  # judgements are of filters alone
+    for (group, filters), estimate in zip(kinds, parts, strict=True):
+        # The axes of filters and nodes first, to go through them.
+        values = np.moveaxis(np.asarray(read(estimate)), (axis, axis + 1), (0, 1))
+        for name, values_of_filter in zip(filters, values, strict=True):
+            for node, value in zip(network.groups[group], values_of_filter, strict=True):
+                by_node[node][name] = value
+    if network.fused:
+        by_node[FUSED] = {name: np.asarray(read(estimate)) for name, estimate in batch["fused"].items()}
+    return by_node
+
+
+def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
+    """Return the uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
+    uplinks = {}
+    for name, fusion in network.fused.items() if outcome else ():
+        if isinstance(fusion, Fusion) and name in outcome:
+            uplinks[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **outcome[name])
+    return uplinks

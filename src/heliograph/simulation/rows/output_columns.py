@@ -1,0 +1,142 @@
+"""Which column of a network's outputs holds what: each filter's estimate, and its judgement of what it received."""
+
+from functools import partial
+from operator import attrgetter
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.model.estimate import Claim
+from heliograph.numerics.module import readable
+from heliograph.numerics.trees.flattened_trees import FlatLayout
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.results_by_name import collect_mode_probabilities, split_by_name
+
+
+class JudgementColumns(NamedTuple):
+    """Columns of the parts of a judgement."""
+
+    distance: int
+    arrived: int
+    reason: int
+    input: int
+
+
+class WeighingColumns(NamedTuple):
+    """Columns of what a filter that weighs made of each of its components."""
+
+    value: tuple[int, ...]
+    variance: tuple[int, ...]
+    weight: tuple[int, ...]
+
+
+class TestColumns(NamedTuple):
+    """Columns of a fused estimate's squared innovation, and of how many numbers arrived."""
+
+    distance: int
+    arrived: int
+
+
+@readable
+class FilterColumns(NamedTuple):
+    """Columns of a filter's estimate among the outputs: first of its mean, first of its covariance, and its judgement.
+
+    Args:
+        node: name of the node; `Network.FUSED` of what is fused.
+        filter: name of the filter or fusion.
+        claim: of its estimate.
+        mean: first column of the mean; the others follow it.
+        covariance: first column of the covariance, row by row.
+        judgement: columns of the filter's `Judgement`; None for a fusion rule, which receives no measurement.
+        weighed: columns of its `Weighed`; None of a filter that weighs nothing.
+        tested: columns of a fusion's squared innovation by what its nodes receive, and of how many numbers these were;
+            None for all others.
+        modes: first column of the modes' probabilities, and that after the last; None of a filter that weighs none.
+    """
+
+    node: str
+    filter: str
+    claim: Claim
+    mean: int
+    covariance: int
+    judgement: "JudgementColumns | None"
+    weighed: "WeighingColumns | None"
+    tested: "TestColumns | None"
+    modes: tuple[int, int] | None = None
+
+    def probabilities(self, outputs: Float[np.ndarray, "... outputs"]) -> Float[np.ndarray, "... M"] | None:
+        """Return the modes' probabilities among outputs; None of a filter that weighs no modes."""
+        return None if self.modes is None else outputs[..., self.modes[0] : self.modes[1]]
+
+
+def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterColumns, ...]:
+    """Return the columns of each filter's outputs in rows that are laid out so.
+
+    They are found from a row 0, 1, 2, ...: taken apart by name as outputs are, it gives the columns in their places.
+    """
+    numbered = jax.tree.map(lambda leaf: leaf.astype(int), outputs.tree(np.arange(float(outputs.size))))
+    # The axis of filters is the third from last of means (filter, node, n), the fourth of covariances.
+    mean = split_by_name(network, numbered, attrgetter("mean"), axis=-3)
+    covariance = split_by_name(network, numbered, attrgetter("covariance"), axis=-4)
+    judged, weighed = _collect_judgements(network, numbered), _collect_weights(network, numbered)
+    modes = {
+        name: (int(columns[0]), int(columns[-1]) + 1)
+        for name, columns in collect_mode_probabilities(network, numbered).items()
+    }
+    tested = {(FUSED, name): TestColumns(*map(int, columns)) for name, columns in numbered["tested"].items()}
+    return tuple(
+        FilterColumns(
+            node=node,
+            filter=name,
+            claim=claim,
+            mean=int(mean[node][name].flat[0]),
+            covariance=int(covariance[node][name].flat[0]),
+            judgement=judged[node].get(name),
+            weighed=weighed.get((node, name)),
+            tested=tested.get((node, name)),
+            modes=modes.get((node, name)),
+        )
+        for node, filters in network.claims().items()
+        for name, claim in filters.items()
+    )
+
+
+def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
+    """Return the columns of what each filter that weighs made of its components, by node and filter.
+
+    `outcome`: outputs of a step, with the numbers of their columns as values.
+    """
+    parts = {
+        name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
+        for name, place in network.places.items()
+        if outcome["weighed"][place.kind] is not None
+    }
+    centrally = outcome["weighed_centrally"].items()
+    central = {(FUSED, name): list(columns) for name, columns in centrally if columns is not None}
+    return {
+        name: WeighingColumns(*(tuple(map(int, field)) for field in columns))
+        for name, columns in (parts | central).items()
+    }
+
+
+def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
+    """Return the columns of each part of a judgement, by node and filter; `outcome` as of `_collect_weights`."""
+    judged = {"estimates": outcome["judged"], "fused": {}}
+    # Each field of the judgements, of which the axes are the last two, (filter, node).
+    fields = range(len(JudgementColumns._fields))
+    parts = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
+    by_node = {
+        node: {name: JudgementColumns(*(int(field[node][name]) for field in parts)) for name in filters}
+        for node, filters in parts[0].items()
+    }
+    central = outcome["judged_centrally"]
+    return by_node | {
+        FUSED: {name: JudgementColumns(*(int(column) for column in columns)) for name, columns in central.items()}
+    }
+
+
+def _read_field(i: int, judged: PyTree) -> np.ndarray:
+    """Return field i of a judgement."""
+    return np.asarray(judged[i])

@@ -1,0 +1,207 @@
+"""Filters of one kind in parallel: stacked along axes of filters and nodes, and vmapped."""
+
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, step_with_judgement
+from heliograph.filters.innovation import Weighed
+from heliograph.filters.plausibility import Judgement, Reason
+from heliograph.filters.smoother_step import SmootherStep
+from heliograph.model.estimate import Estimate, Innovation
+from heliograph.model.over_time import stack
+from heliograph.model.sensor import without_output_names
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import Network
+
+
+class StepOutput(NamedTuple):
+    """Output of a filter's step.
+
+    Args:
+        estimate: after the step.
+        steps: what a smoother needs of the step; None unless asked for.
+        judgement: whether the data were plausible; None unless asked for.
+        weighed: the innovation by component, of a filter that judges its data and weighs components; None of others.
+    """
+
+    estimate: Estimate
+    steps: SmootherStep | None = None
+    judgement: Judgement | None = None
+    weighed: Weighed | None = None
+
+
+def filter_step(
+    filter: AbstractFilter,
+    state: PyTree,
+    z: jax.Array,
+    u: jax.Array,
+    k: jax.Array,
+    smooths: bool,
+    judges: bool = False,
+    skip: jax.Array | None = None,
+) -> tuple[PyTree, StepOutput]:
+    """Step a filter: return its next state, and its output.
+
+    Args:
+        filter: the filter.
+        state: before the step.
+        z: measurement (received,), NaN where a component is missing.
+        u: inputs of the plant over the step.
+        k: number of the step.
+        smooths: put out a smoother step too.
+        judges: put out a judgement of the data too.
+        skip: code of the reason not to use z, 0 if there is none: then nothing of it arrived, and where the prediction
+            itself is no number the state before it stays. None: use z.
+    """
+    # Data that are not used count as not arrived.
+    z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
+    judgement, weighed = None, None
+    # With a smoother step; it has no judgement of its own, which is made by a step beside it.
+    if smooths:
+        if judges:
+            *_, judgement, innovation = step_with_judgement(filter, state, z, u, k)
+            weighed = get_weighed_components(innovation)
+        after, steps = filter.step_with_smoother(state, z, u, k)
+        return after, StepOutput(filter.after_step(after, k), steps, judgement, weighed)
+    # With a judgement, or alone.
+    if judges:
+        after, estimate, judgement, innovation = step_with_judgement(filter, state, z, u, k)
+        weighed = get_weighed_components(innovation)
+    else:
+        after, estimate = filter.step(state, z, u, k)
+    # A prediction that is no number leaves the state as it was.
+    if skip is not None:
+        stays, before = skip == Reason.PREDICTION, (state, filter.estimate(state))
+        after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), before, (after, estimate))
+    return after, StepOutput(estimate, judgement=judgement, weighed=weighed)
+
+
+def get_weighed_components(innovation: Innovation) -> Weighed | None:
+    """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others."""
+    if innovation.weight is None:
+        return None
+    return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
+
+
+class StackedFilters(Module):
+    """Filters that differ in numbers alone, stacked along one axis: filter after filter, and for each node after node.
+
+    Args:
+        filters: the stack (filter and node, ...).
+        group: number of the group of nodes that they belong to.
+        count: of filters at each node.
+        nodes: their number.
+        smooths: each step puts out a smoother step.
+        judges: each step puts out a judgement of its data.
+    """
+
+    filters: AbstractFilter
+    group: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
+    smooths: bool = eqx.field(static=True, default=False)
+    judges: bool = eqx.field(static=True, default=False)
+
+    def init(self) -> PyTree:
+        """Return states before the first step, (filter and node, ...)."""
+        return map_all(initial_state, self.count * self.nodes)(self.filters)
+
+    def step(
+        self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
+    ) -> tuple[PyTree, StepOutput]:
+        """Step each filter: return the next states (filter and node, ...), and outputs (filter, node, ...).
+
+        Args:
+            states: before the step (filter and node, ...).
+            z: measurements (node, received) of the group.
+            u: inputs of the plant over the step.
+            k: number of the step.
+            skip: codes of the reasons not to use them (filter, node), 0 where there is none; None: use all.
+        """
+
+        def step_one(
+            filter: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
+        ) -> tuple[PyTree, StepOutput]:
+            """Step one filter of one node."""
+            return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
+
+        reasons = None if skip is None else skip.reshape(-1)
+        step_all = map_all(step_one, self.count * self.nodes)
+        after, outputs = step_all(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
+
+    def compute_by_node(
+        self, function: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+    ) -> PyTree:
+        """Return function(filter, state, z, u, k) of filter number f at each node, with a leading axis of nodes.
+
+        `states`: of all filters before step k. `z`: measurements (node, received).
+        """
+        filters, states = self.take_filter(f, states)
+        return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
+
+    def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
+        """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
+        rows = slice(f * self.nodes, (f + 1) * self.nodes)
+        taken: tuple[AbstractFilter, PyTree] = jax.tree.map(
+            lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states)
+        )
+        return taken
+
+
+def initial_state(filter: AbstractFilter) -> PyTree:
+    """Return the state of a filter before the first step, on the device."""
+    return jax.tree.map(jnp.asarray, filter.init())
+
+
+def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
+    """Return the function of stacks of `size` that applies a function of one to each; its arguments are arrays' rows.
+
+    `size` is given, since a stack may hold no array. One alone is not vectorised: that takes half as long to trace.
+    """
+    if size == 1:
+        return partial(_apply_to_one, function)
+    apply: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
+    return apply
+
+
+def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
+    """Apply a function of one to a stack of one, without the cost of `vmap`."""
+
+    def drop_axis(leaf: PyTree) -> PyTree:
+        """Return the only row of an array."""
+        return jax.lax.squeeze(leaf, (0,)) if eqx.is_array(leaf) else leaf
+
+    def add_axis(leaf: PyTree) -> PyTree:
+        """Return an array as the only row of another."""
+        return jax.lax.expand_dims(leaf, (0,)) if eqx.is_array(leaf) else leaf
+
+    return jax.tree.map(add_axis, function(*jax.tree.map(drop_axis, stacked)))
+
+
+def stack_by_kind(network: Network, smoothed_kinds: Collection[int], judges: bool) -> tuple[StackedFilters, ...]:
+    """Return the nodes' filters, those of each kind stacked, filter after filter and node after node for each.
+
+    `smoothed_kinds`: numbers of the kinds whose steps are to be smoothed. `judges`: filters judge their data.
+    """
+    alike = []
+    for number, kind in enumerate(network.kinds):
+        nodes = network.groups[kind.group]
+        filters = [without_output_names(network.nodes[node].filters[f]) for f in kind.filters for node in nodes]
+        alike.append(
+            StackedFilters(
+                filters=stack(filters),
+                group=kind.group,
+                count=len(kind.filters),
+                nodes=len(nodes),
+                smooths=number in smoothed_kinds,
+                judges=judges,
+            )
+        )
+    return tuple(alike)

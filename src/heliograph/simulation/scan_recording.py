@@ -1,0 +1,228 @@
+"""All filters of a network over the rows of a recording: in one scan, in chunks side by side, or part after part."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.chunks import scan_in_chunks
+from heliograph.filters.linear_recursion import Recursion
+from heliograph.model.forecast_origin import Origin
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.numerics.types import Array, PyTree
+from heliograph.simulation.implausible_data import step_plausibly
+from heliograph.simulation.network_filters import AllFilters, initial_states
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.smoothed import NetworkSmoother
+
+EXPECTED = "what hg.run of this network returned for the rows before"
+ROWS = 128  # of a recording with fusions between neighbours, whose weights are in memory at a time
+
+
+class RecordingStart(NamedTuple):
+    """Where rows begin that go on behind others: the filters' states there, and the number of the first row (step)."""
+
+    states: PyTree
+    step: np.ndarray
+
+
+class FilteringTask(NamedTuple):
+    """All that a recording is filtered with but its measurements.
+
+    Args:
+        filters: of the network.
+        smoother: of their estimates; None where they are not smoothed.
+        u: inputs of the plant (steps, inputs).
+        arrivals: which reports arrived of each fusion by reports, and which messages of one between neighbours, by
+            name.
+        begin: of rows behind others; None of the first ones.
+    """
+
+    filters: AllFilters
+    smoother: NetworkSmoother | None
+    u: np.ndarray
+    arrivals: dict[str, PyTree]
+    begin: RecordingStart | None = None
+
+    def first_states(self) -> PyTree:
+        """Return the states before the first of these rows."""
+        return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
+
+    def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
+        """Return the rows, with a leading axis of steps: their numbers, inputs, measurements z, and what arrived."""
+        numbers: Array = jnp.arange(len(self.u))
+        if self.begin is not None:
+            numbers = self.begin.step + numbers
+        return numbers, self.u, z, self.arrivals
+
+
+def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> Origin:
+    """Return where the rows of a record ended, with the states there of these filters.
+
+    Args:
+        filters: of the network.
+        after: record of the rows before.
+        smooths: whether estimates are to be smoothed.
+
+    Raises:
+        ValueError: no such record; smoothing, which needs all rows; a fusion whose messages may come rows later.
+    """
+    origin = instance("after", after, Record, EXPECTED).origin
+    if origin is None:
+        raise fail("after", EXPECTED, "a record without the last states of its filters")
+    if smooths:
+        raise fail("after", "no smoothing, which needs all rows at once", "smooth")
+    if late := [*filters.reporting, *filters.meshes]:
+        raise fail("after", "no fusion by reports or between neighbours, which may come rows later", late)
+    if not origin.has_form_of(jax.eval_shape(filters.init)):
+        raise fail("after", EXPECTED, "one of another network")
+    return origin
+
+
+def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
+    """Return the times of rows (`clock`) behind that of the last row before them, where `origin` has one.
+
+    Raises:
+        ValueError: their first time is before it, or is a date where that is a number, or the reverse.
+    """
+    if origin is None:  # nothing is before them
+        return clock
+    last, first = np.asarray(origin.time), clock[0]
+    if last.dtype.kind != clock.dtype.kind or first < last:
+        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
+    return np.append(last, clock)
+
+
+def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what all filters made of a recording's rows, as NumPy arrays: what `AllFilters.step` puts out, by row.
+
+    Beside that stand "measurements", z, and "state", the last one; with a smoother it is what
+    `NetworkSmoother.smooth_run` returns. It is computed in chunks side by side, by native code, or by XLA.
+
+    Args:
+        task: filters and all else.
+        z: measurements (steps, node, received) by group.
+        judged: leave out what is implausible.
+    """
+    results = None if judged else _filter_in_chunks(task, z)
+    if results is not None:
+        return results
+    # XLA for a joint covariance: the graph, an argument here, decides where its blocks are stored.
+    by_xla = any(mesh.has_long_step or mesh.needs_joint for mesh in task.filters.meshes.values())
+    return _scan_in_parts(task, z, judged) if by_xla else compute_once(_scan_all_rows, _by_xla, (task, z, judged))
+
+
+class NetworkRecursion(Recursion):
+    """Recursion of all filters of a network over rows, of which `begin` is the number of the first.
+
+    Each row's output is all that they estimate and judge.
+    """
+
+    filters: AllFilters
+    begin: Array
+
+    def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
+        """Step all filters over one row; return their states and what is recorded of them."""
+        z, u = row
+        return self.filters.step(state, z, jnp.asarray(u), jnp.asarray(self.begin + k), {})
+
+
+def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree | None:
+    """Return what `filter_rows` does, of rows in chunks side by side; None where that cannot be.
+
+    All filters must be linear, and take each measurement as it is; results are not smoothed, and rows are many.
+    """
+    if task.smoother is not None or not task.filters.are_linear_and_unfused:
+        return None
+    begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
+    filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
+    return None if filtered is None else _collect_results(None, z, *filtered)
+
+
+def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what `filter_rows` does, by XLA, some rows at a time.
+
+    Weights between neighbours that depend on arrivals alone are computed ahead, for these rows at once.
+    """
+    filters, smoother, u, arrivals, _ = task  # rows of such a network are behind no others
+    # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
+    count = -(-len(u) // ROWS)
+    size = -(-len(u) // count)
+    rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
+    for start in range(0, len(u), size):
+        # The last part is filled with its last row, which does not count again.
+        indices = np.minimum(np.arange(start, start + size), len(u) - 1)
+        k, u_k, z_k, drawn = jax.tree.map(lambda leaf, rows=indices: np.asarray(leaf)[rows], rows)
+        drawn |= {name: (drawn[name], mesh.compute_weights_ahead(drawn[name])) for name, mesh in filters.meshes.items()}
+        is_counted = np.arange(start, start + size) < len(u)
+        states, results = _scanned_by_xla(filters, states, (k, u_k, z_k, drawn), judged, is_counted)
+        parts.append(to_numpy(results))
+    all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
+    return to_numpy(_collect_results(smoother, z, states, all_rows))
+
+
+def _scan_all_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
+    """Return what `filter_rows` does, of all rows in one scan."""
+    return _collect_results(task.smoother, z, *_scan_rows(task.filters, task.first_states(), task.rows(z), judged))
+
+
+def _scan_rows(
+    filters: AllFilters, states: PyTree, rows: tuple[PyTree, ...], judged: bool, is_counted: np.ndarray | None = None
+) -> tuple[PyTree, dict[str, PyTree]]:
+    """Step over rows: return the last states, and the results by row.
+
+    Args:
+        filters: of the network.
+        states: before the first row.
+        rows: as `FilteringTask.rows` returns them.
+        judged: leave out what is implausible.
+        is_counted: rows that are not change no state (steps,); None: all are.
+    """
+
+    def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        """Step all filters over one row."""
+        (k, u_k, z_k, drawn), row_is_counted = row
+        step = step_plausibly if judged else AllFilters.step
+        after, results = step(filters, states, z_k, u_k, k, drawn)
+        if row_is_counted is not None:
+            after = jax.tree.map(lambda new, old: jnp.where(row_is_counted, new, old), after, states)
+        return after, results
+
+    states, results = jax.lax.scan(step_row, states, (rows, is_counted))
+    return states, results
+
+
+def _collect_results(
+    smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
+) -> PyTree:
+    """Return what `filter_rows` does from the filters' `results` by row and their last `state`, smoothed if to be."""
+    results = {"measurements": z, **results}
+    judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
+    return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
+
+
+def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
+    """Return the states of the central filters before each row (steps, ...), by name; z as of `filter_rows`."""
+    return compute_once(_collect_central_states, _central_states_by_xla, (task._replace(smoother=None), z))
+
+
+def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
+    """Return what `find_central_states_before_rows` does, by a scan over the rows."""
+
+    def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+        """Step all filters; the central ones' states before the step are the output."""
+        k, u_k, z_k, drawn = row
+        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, drawn)
+        _, central, *_ = states
+        return after, central
+
+    before: PyTree
+    _, before = jax.lax.scan(step, task.first_states(), task.rows(z))
+    return before
+
+
+_by_xla, _scanned_by_xla = quickly_compiled(_scan_all_rows), quickly_compiled(_scan_rows)
+_central_states_by_xla = quickly_compiled(_collect_central_states)

@@ -1,0 +1,183 @@
+"""Channels in a run: their draws, and those of memories that several of them may share.
+
+Draws depend on the run's key, the step and a number: a checksum of the channel's name, or of its memory's. Memories
+with one number have the same draws, so that they are one memory. `shared` in arguments: these numbers of a model's
+memories.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at, stack, structure_key
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.delay import signal_size
+from heliograph.random_affine.markov_chain_and_autoregression import AbstractMemory, unique_memories
+from heliograph.random_affine.memories_of_channels import (
+    draw_with_shared_memories,
+    drop_names,
+    init_with_shared_memories,
+    memories,
+)
+from heliograph.random_affine.moments.signal_path import apply
+from heliograph.simulation.random_keys import (
+    CHANNEL,
+    CHANNEL_START,
+    MEMORY,
+    MEMORY_START,
+    Number,
+    checksum,
+    draw_key,
+)
+
+MemoryNumbers = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a channel
+
+PLANT = "plant"  # whose memories others may share, with a name or without
+
+
+def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
+    """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
+
+    They come from the memories' names, or from the channel's where these have none.
+
+    Args:
+        channels: by name; each may be any tree of models, such as a sensor and its channel.
+        plant: a memory that it has too is the plant's.
+
+    Raises:
+        ValueError: one name for memories that differ.
+    """
+    of_plant = {identity: i for i, identity in enumerate(memories(plant))}
+    # One object under many names is looked at once.
+    objects = {id(channel): channel for channel in channels.values()}
+    memories((plant, tuple(objects.values())))  # raises where one name stands for memories that differ
+    memories_of = {key: memories(channel) for key, channel in objects.items()}
+    unique_memories(memory for by_identity in memories_of.values() for memory in by_identity.values())  # raises too
+    numbers = {}
+    for name, channel in channels.items():
+        sources = [_name_source(m, i, name, of_plant) for i, m in enumerate(memories_of[id(channel)].values())]
+        numbers[name] = np.array([checksum(source) for source in sources], dtype=np.uint32)
+    return numbers
+
+
+def _name_source(memory: AbstractMemory, i: int, name: str, of_plant: Mapping[str, int]) -> str:
+    """Return the name by which a memory's draws are seeded: its own, the plant's number of it, or the channel's.
+
+    `i`: number of the memory in the channel `name`. `of_plant`: numbers of the plant's memories, by identity.
+    """
+    if memory.name is not None:
+        return memory.identity
+    if memory.identity in of_plant:
+        return f"{PLANT}\tmemory {of_plant[memory.identity]}"
+    return f"memory {i} of {name}"
+
+
+class ChannelGroup(Module):
+    """Channels of one structure, stacked.
+
+    Args:
+        channel: the stack, with a leading axis of channels.
+        checksums: of their names (channel,), which seed their draws.
+        memories: numbers that seed the draws of their memories (channel, memory).
+        places: of each among all channels (channel,).
+    """
+
+    channel: Channel
+    checksums: np.ndarray
+    memories: np.ndarray
+    places: np.ndarray
+
+
+def group_channels(channels: Mapping[str, Channel]) -> tuple[ChannelGroup, ...]:
+    """Return the channels by structure: those of one are stacked, with a row for each name.
+
+    Names of memories do not matter to the structure.
+    """
+    listed, memories = list(channels.values()), list(number_memory_seeds(channels).values())
+    checksums = np.array([checksum(name) for name in channels], dtype=np.uint32)
+    # Rows of each structure's channels, by the objects' identities: one object under many names is stacked once.
+    unnamed = {identity: drop_names(channel) for identity, channel in {id(c): c for c in listed}.items()}
+    rows_by_structure: dict[object, dict[int, int]] = {}
+    for identity, channel in unnamed.items():
+        row_of = rows_by_structure.setdefault(structure_key(channel), {})
+        row_of[identity] = len(row_of)
+    # A group for each structure: its channels stacked, then one row for each name that has one of them.
+    groups = []
+    for row_of in rows_by_structure.values():
+        places = np.array([i for i, channel in enumerate(listed) if id(channel) in row_of])
+        rows = np.array([row_of[id(listed[i])] for i in places])
+        stacked = stack([unnamed[identity] for identity in row_of])
+        channel = jax.tree.map(lambda leaf, rows=rows: leaf[rows] if eqx.is_array(leaf) else leaf, stacked)
+        groups.append(
+            ChannelGroup(
+                channel=channel,
+                checksums=checksums[places],
+                memories=np.stack([memories[i] for i in places]),
+                places=places,
+            )
+        )
+    return tuple(groups)
+
+
+class LateChannelState(NamedTuple):
+    """State of a late channel: of the `channel` itself, and the `line` of signals sent before, the last first."""
+
+    channel: PyTree
+    line: jax.Array
+
+
+def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
+    """Return a channel's state before the first step of the run with this key.
+
+    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    """
+    link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
+    keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
+    state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
+    return LateChannelState(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
+
+
+def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
+    """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
+    numbered = zip(memories(models).values(), shared, strict=True)
+    return tuple(memory.begin(draw_key(key, 0, number, MEMORY_START)) for memory, number in numbered)
+
+
+def move_modes(
+    models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: MemoryNumbers
+) -> tuple[jax.Array, ...]:
+    """Return the states of the memories of a plant or sensor at the step after k; those of one number move alike."""
+    moves = zip(memories(models).values(), states, shared, strict=True)
+    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in moves)
+
+
+def deliver_signal(
+    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: MemoryNumbers
+) -> tuple[PyTree, jax.Array]:
+    """Draw the channel at step k and apply it to y, a late one to past signals too; return next state and output.
+
+    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    """
+    link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
+    if link.past:  # a late link carries y and the signals before it, the last first
+        line = jnp.concatenate([y, state.line])
+        after, h = _draw_link(link, state.channel, key, k, link_key, shared)
+        return LateChannelState(after, line[: -len(y)]), apply(h, line)
+    state, h = _draw_link(link, state, key, k, link_key, shared)
+    return state, apply(h, y)
+
+
+def _draw_link(
+    link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: MemoryNumbers
+) -> tuple[PyTree, jax.Array]:
+    """Draw a link, its memories by keys of their own; return its next state and its matrix."""
+    if not len(shared):
+        return link.draw(state, link_key)
+    return draw_with_shared_memories(link, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])
