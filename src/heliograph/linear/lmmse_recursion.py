@@ -124,8 +124,8 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         gains, root = _make_gains(system, matrices, covariances), covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
-    over_time = Gains(*(repeat_last(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
-    claim = _support_claim(claim, rounding.worst, rounding.when)
+    over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
+    claim = _lower_unsupported_claim(claim, rounding.worst, rounding.when)
     return with_premise(Schedule(over_time, system.mean, claim), system.kept.premise)
 
 

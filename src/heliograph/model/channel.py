@@ -180,7 +180,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False)
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
     return build_with_told_numbers(
-        lambda links: Delayed(links[0], delay, timestamped), check_maps("delayed link", [link])
+        lambda links: DelayedLink(links[0], delay, timestamped), check_maps("delayed link", [link])
     )
 
 

@@ -180,7 +180,7 @@ def separate_told_numbers(channel: AbstractRandomAffine) -> SeparatedToldNumbers
     if not rows:
         return SeparatedToldNumbers(channel, values, ())
     link = links[0] if len(links) == 1 else Stack(links)
-    numbers = [row for affine in told_maps(link) for row in rows[affine.memory.identity]]
+    numbers = [row for affine in list_told_maps(link) for row in rows[affine.memory.identity]]
     return SeparatedToldNumbers(link, values, tuple(numbers))
 
 

@@ -15,7 +15,7 @@ from heliograph.models.joined_plants import join
 from heliograph.models.time_series import Component
 from heliograph.numerics.check import array, fail, instance, items
 from heliograph.numerics.module import Module, readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array, ArrayLike, Float, Names
 from heliograph.random_affine.noise import NoiseLike
 

@@ -26,7 +26,7 @@ from heliograph.numerics.frozen_mapping import FrozenMapping
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.memory import drop_names
+from heliograph.random_affine.memories_of_channels import drop_names
 from heliograph.simulation.mode_flag_check import check_flags
 from heliograph.simulation.sender_checks import (
     check_encoder,

@@ -13,7 +13,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.runs.stacked_filters import StackedFilters, map_all
-from heliograph.smoothing.backward_pass import plan_with_past
+from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_steps
 
 
 def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:

@@ -13,7 +13,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import condition_on_memories
+from heliograph.random_affine.memories_of_channels import condition_on_memories
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.random_keys import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.transmission.channel_draws import (

@@ -17,6 +17,7 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+from heliograph.random_affine.series_and_stack import Series
 from heliograph.simulation.filter_recording import run
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node

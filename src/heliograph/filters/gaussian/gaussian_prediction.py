@@ -220,7 +220,7 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = read_first_plant(plant)
-    mean, spread, prior_given = prior_of(start, initial_mean, initial_covariance)
+    mean, spread, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     linear = isinstance(start, LinearPlant) and not prior_given and not start.circular
     claim = lower_claim_by_noise("exact" if linear else "nominal", plant)
     return OpenLoop(

@@ -114,7 +114,7 @@ class LinearFilter(AbstractSizedFilter):
     def has_known_gain(self) -> bool:
         """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
         whole = stack_over_time(self.channel)
-        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
+        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded_noises(self.sensor))
 
     def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
@@ -228,7 +228,9 @@ def linear_filter(
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded(sensor) else filter
+        return (
+            replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded_noises(sensor) else filter
+        )
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.plan import LinearStep, PlannedFilter
 from heliograph.filters.modes.modal import ChannelByMode, channels_by_mode
-from heliograph.linear.jump_system import mix_modes, propagate_by_mode
+from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at, first

@@ -380,11 +380,13 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""
-        return sum_clouds(weight, particles, self._angles_in_order(list_mode_models(first(self.plant))[0]))
+        return sum_clouds_for_mean(weight, particles, self._angles_in_order(list_mode_models(first(self.plant))[0]))
 
     def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
-        return sum_clouds_apart(weight, particles, sums, self._angles_in_order(list_mode_models(first(self.plant))[0]))
+        return sum_clouds_for_covariance(
+            weight, particles, sums, self._angles_in_order(list_mode_models(first(self.plant))[0])
+        )
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""

@@ -126,7 +126,7 @@ def word_filter(
     # The words, the component of y (or flag) at each output of the channel, and what the link does to bits.
     words = _alphabet_of(first(sensor), encoder)
     places = find_carried_components(channel)
-    links = at_each_step(describe_link, channel)
+    links = at_each_step(make_link_of_bits, channel)
     no_flips = all(is_free_of_flips(link) for link in unstack(links))
     if encoder is None and not no_flips:
         raise fail("encoder", "Words, whose bits the channel flips", "none")
@@ -150,5 +150,5 @@ def word_filter(
         certain=no_flips,
         **make_sizes("nominal", start, len(places) + dithers),
     )
-    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else keep_two_hypotheses(one_gaussian)
+    filter: AbstractFilter = one_gaussian if no_flips or hypotheses == 1 else make_two_hypotheses_filter(one_gaussian)
     return with_premise(filter, Premise(plant, sensor, channel, encoder=encoder, order=None))

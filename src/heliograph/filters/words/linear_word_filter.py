@@ -126,7 +126,7 @@ def build_behind_words(
     gains = _gains_by_mode(laws if told_modes else [numbers], words) if encoder.subtracts else np.zeros((1, 0))
     # Behind a late link the noise of rounding is counted from the first step on, before any word can have come.
     claim_of_delay: Claim = "upper" if first(channel).past else "exact"
-    claim = weakest([lower_claim_by_noise(base.claim, rounded), claim_of_delay, _claim_of(overload)])
+    claim = weakest([lower_claim_by_noise(base.claim, rounded), claim_of_delay, _claim_despite_overload(overload)])
     return LinearWordsFilter(
         base=base,
         centres=centres,

@@ -200,7 +200,7 @@ def build_told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make
     """
     # The link without the numbers that are reported beside it; and the filter for typical numbers. It predicts, as no
     # prediction depends on them.
-    link = at_each_step(lambda channel: make_certain(separate_told_numbers(channel).link), channel)
+    link = at_each_step(lambda channel: make_laws_certain(separate_told_numbers(channel).link), channel)
     base = make(plant, sensor, at_each_step(believe_typical, link))
     claim = base.claim
     if any(affine.reason_for_no_claim for affine in list_told_maps(first(link))):

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from scipy.special import logsumexp, ndtr
 
-from heliograph.factors.roots import covariance_of_root, observe_root, roots_of
+from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
 from heliograph.filters.likelihood_filter import likelihood_filter
 from heliograph.model.checks.row_times import read_row_dates
 from heliograph.model.plant import AbstractPlant, AnyPlant

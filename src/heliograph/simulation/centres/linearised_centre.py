@@ -107,7 +107,7 @@ class LinearisedCentre(Module):
         return following, results
 
 
-def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: Linearised) -> ErrorStep:
+def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: LinearisedStep) -> ErrorStep:
     """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
 
     The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
@@ -135,7 +135,7 @@ def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMo
 
 
 def _compute_drift_of_mean_errors(
-    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: Linearised
+    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
     """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
 

@@ -210,7 +210,7 @@ class Mesh(Module):
         if state.sent is None or self.alpha is None:
             return now
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
-        information = jax.vmap(invert)(state.covariance)[self.senders]
+        information = jax.vmap(invert_positive_definite)(state.covariance)[self.senders]
         moved = find_event_senders(self.alpha, now - state.sent, information, self.senders, self.edges.present)
         return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
 

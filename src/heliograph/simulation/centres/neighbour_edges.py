@@ -207,7 +207,7 @@ def check_edge(what: str, link: Channel) -> None:
         if late is not None and not (late.constant or late.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
-        _, inside = _split_losses_from_link(step, Erasure | Delayed)
+        _, inside = _split_losses_from_link(step, Erasure | DelayedLink)
         for mode_link in inside.maps if isinstance(inside, Modes) else [inside]:
             _, mode = _split_losses_from_link(mode_link)
             if mode.remembers or mode.past or not _is_perfect(mode):
@@ -218,7 +218,7 @@ def check_edge(what: str, link: Channel) -> None:
 def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
     """Return the delay inside a link, whose messages may also be lost; None of a link without delay."""
     _, inside = _split_losses_from_link(channel)
-    return inside if isinstance(inside, Delayed) else None
+    return inside if isinstance(inside, DelayedLink) else None
 
 
 def _split_losses_from_link(
@@ -248,7 +248,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     """
     if channel is None or isinstance(channel, OverTime):
         return 0.0 if channel is None else None
-    arrival, inside = _split_losses_from_link(channel, Erasure | Delayed)
+    arrival, inside = _split_losses_from_link(channel, Erasure | DelayedLink)
     if not isinstance(inside, Modes):
         return None if inside.erases else 1 - float(arrival)
     chances = [find_arrival_probability(mode) for mode in inside.maps]

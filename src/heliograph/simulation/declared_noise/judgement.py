@@ -16,7 +16,7 @@ from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import fail, instance, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
-from heliograph.random_affine.reported_law import AbstractTold
+from heliograph.random_affine.channel_state_information import AbstractToldMap
 from heliograph.simulation.declared_noise.innovation_tests import LEVEL, InnovationTests, examine_innovations
 from heliograph.simulation.declared_noise.refit import (
     DeclaredRows,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.model.augmented.bias import with_bias
 from heliograph.model.channel_side_information import LinkGivenNumbers
 from heliograph.model.over_time import first

@@ -12,7 +12,7 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.module import LINES, cut
 from heliograph.numerics.numpy_or_jax import describe_rounded, is_traced
 from heliograph.random_affine.composite import ARROW, DIRECT
-from heliograph.random_affine.memory import memories
+from heliograph.random_affine.memories_of_channels import memories
 from heliograph.simulation.covariance_claims import yield_mistaken_beliefs
 from heliograph.simulation.description.rounded_to_single import find_rounded_parts
 from heliograph.simulation.node import FUSED, HasNodes, Node

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
 from heliograph.filters.words.linear import SEEN
-from heliograph.filters.wrappers.reported_law import ToldFilter, believe_typical
+from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typical
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first

@@ -262,7 +262,7 @@ def _make_step(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
         """Step a row of the network that has these numbers as its arrays; return states and outputs."""
-        network_step = layout.static.filled(numbers)  # the structure with these arrays put back into it
+        network_step = layout.static.with_arrays(numbers)  # the structure with these arrays put back into it
         stepped: tuple[PyTree, PyTree] = network_step.step(*layout.split_row(row))
         return stepped
 
