@@ -159,7 +159,7 @@ def test_every_method_finds_what_it_needs(after_make_demo, monkeypatch):
     def begin(target):
         raise BegunError
 
-    monkeypatch.setattr("heliograph.report.results.whole_folder", begin)
+    monkeypatch.setattr("heliograph.report.results_folder.whole_folder", begin)
     methods = [e.name for e in entry_points(group="heliograph.studies") if e.attr == "publication"]
     assert len(methods) == 5
     for method in methods:

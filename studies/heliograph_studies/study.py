@@ -15,7 +15,7 @@ import heliograph
 from heliograph.numerics.process.extras import check_installed
 from heliograph.report.pages.page import KeyFigures, Page, Section, Table
 from heliograph.report.progress import Advance, progress
-from heliograph.report.results import Results, write_results
+from heliograph.report.results_folder import Results, write_results
 from heliograph_studies import markdown
 from heliograph_studies.outcome import summary
 from heliograph_studies.settings import content, differences, digest, with_values

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import Results
     from heliograph.simulation.network import Network
 
 NAME = "backtest"
@@ -49,7 +49,7 @@ def backtest(
     """
     from heliograph.disk.quoting import visible
     from heliograph.numerics.check import check_count, fail
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Check the options before anything is computed.
     target = choose_results_folder("backtest", out, NAME) / NAME

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
     from heliograph.report.pages.design import DesignResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import Results
 
 NAME = "design"
 
@@ -29,7 +29,7 @@ def design(
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.design_file import read_design
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Read and check everything before the computation starts.
     target = choose_results_folder("design", out, NAME) / NAME

@@ -121,7 +121,7 @@ def filter_rows(
 
 def _describe_doubted(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
-    from heliograph.report.outputs import summarise_weighed_outputs
+    from heliograph.report.sensor_output_health import summarise_weighed_outputs
 
     return [str(output) for output in summarise_weighed_outputs(network, record)]
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from heliograph.learning.losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Json, Results
+    from heliograph.report.results_folder import Json, Results
     from heliograph.simulation.network import Network
 
 STAGES = 6  # of the work, for the progress bar
@@ -54,7 +54,7 @@ def fit(
         where it holds several. The name may be that of a function that returns one.
     """
     from heliograph.numerics.check import check_count, check_seed, scalar
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Check the options before the work starts.
     share = float(scalar("--held-out", held_out, 0.0, 0.9))
@@ -229,7 +229,7 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import Results
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 

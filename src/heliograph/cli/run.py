@@ -185,7 +185,7 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 def _describe_errors(record: "Record") -> list[str]:
     """Return a line on the errors of each filter if the truth is known: RMSE by state, and NEES (1: claim holds)."""
-    from heliograph.report.outputs import compare_with_truth, round_to
+    from heliograph.report.sensor_output_health import compare_with_truth, round_to
 
     lines = []
     for errors in compare_with_truth(record):
@@ -203,7 +203,7 @@ def _check_output_places(
     from heliograph.files.logs.log import PACKAGES
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
-    from heliograph.report.results import NEEDS
+    from heliograph.report.results_folder import NEEDS
 
     endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
     needed = [package for ending in endings & PACKAGES.keys() for package in PACKAGES[ending]]
@@ -222,7 +222,7 @@ def _check_output_places(
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
         from heliograph.disk.whole_file import check_replaceable
-        from heliograph.report.results import SUMMARY
+        from heliograph.report.results_folder import SUMMARY
 
         check_replaceable(report, SUMMARY)
 
@@ -245,8 +245,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
 
-    from heliograph.report.health import Health, examine
-    from heliograph.report.results import Results, write_results
+    from heliograph.report.recording_diagnosis import Health, examine
+    from heliograph.report.results_folder import Results, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
         """Return the diagnosis of a plant, with its forecasts and residuals."""

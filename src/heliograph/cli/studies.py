@@ -107,7 +107,7 @@ def run_studies(
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
     from heliograph.numerics.process.extras import check_installed
-    from heliograph.report.results import NEEDS
+    from heliograph.report.results_folder import NEEDS
 
     known = list_studies(kind)
     _check_names(names, known, kind)

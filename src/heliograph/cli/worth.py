@@ -155,7 +155,7 @@ def write_figure(worth: "SensorWorth", options: WorthOptions) -> None:
         return
     from heliograph.disk.whole_file import whole_file
     from heliograph.report.figures import png, svg
-    from heliograph.report.pages.worth import draw_worth
+    from heliograph.report.pages.sensor_worth import draw_worth
 
     figure = draw_worth(worth, f"error after {options.steps} steps, {worth.describe_method(options.runs)}")
     with whole_file(options.figure) as partial:

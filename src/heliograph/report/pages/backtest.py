@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
-from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
-from heliograph.report.results import Json, Results
+from heliograph.report.results_folder import Json, Results
+from heliograph.report.sensor_output_health import round_to
 
 if TYPE_CHECKING:
     import heliograph

@@ -16,7 +16,7 @@ from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
-from heliograph.report.results import Json, Results
+from heliograph.report.results_folder import Json, Results
 
 MOST = 40  # transmitters that are drawn; the table and the summary hold all
 ROUNDING = 1e-12  # of the total power

@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoting import visible
 from heliograph.numerics.check import instance
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
-from heliograph.report.forecasts import draw_forecasts, forecast_tables
-from heliograph.report.health import Health
-from heliograph.report.innovations import (
+from heliograph.report.forecast_figures import draw_forecasts, forecast_tables
+from heliograph.report.innovations_section import (
     BAND,
     COLOURS,
     LOOK,
@@ -26,9 +25,8 @@ from heliograph.report.innovations import (
     make_innovations_section,
     say_not_drawn,
 )
-from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
-from heliograph.report.outputs import compare_with_truth, round_to
-from heliograph.report.pages.links import draw_deliveries, make_links_blocks
+from heliograph.report.mode_probability_figures import PREFIX, draw_modes_of_nodes
+from heliograph.report.pages.links_section import draw_deliveries, make_links_blocks
 from heliograph.report.pages.page import (
     KeyFigure,
     KeyFigures,
@@ -40,10 +38,12 @@ from heliograph.report.pages.page import (
     Table,
     Text,
 )
-from heliograph.report.pages.predicted import draw_predicted_figures, make_predicted_sections
+from heliograph.report.pages.predictions import draw_predicted_figures, make_predicted_sections
 from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import draw_position_map, find_coordinates
-from heliograph.report.results import Json, Results, write_into_folder
+from heliograph.report.recording_diagnosis import Health
+from heliograph.report.results_folder import Json, Results, write_into_folder
+from heliograph.report.sensor_output_health import compare_with_truth, round_to
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

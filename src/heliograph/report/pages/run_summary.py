@@ -4,9 +4,9 @@ import numpy as np
 
 from heliograph.numerics.check import instance
 from heliograph.report.arrivals import Arrivals
-from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import compare_with_truth, summarise_output
-from heliograph.report.results import Json
+from heliograph.report.recording_diagnosis import FilterHealth, Health
+from heliograph.report.results_folder import Json
+from heliograph.report.sensor_output_health import compare_with_truth, summarise_output
 from heliograph.simulation.results.record import Record
 
 

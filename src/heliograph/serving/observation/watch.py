@@ -16,7 +16,7 @@ from heliograph.model.checks.refusals import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
-from heliograph.report.outputs import RecentOutputs, make_output_row
+from heliograph.report.sensor_output_health import RecentOutputs, make_output_row
 from heliograph.serving.count_totals import FIELDS, CountTotals, counts_of
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import PlantTroubles, TroubleOverview

@@ -11,8 +11,8 @@ from heliograph.model.plant import LinearPlant
 from heliograph.model.sensor import LinearSensor
 from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
-from heliograph.report.constant_error import MOST, ConstantError, find_constant_error
-from heliograph.report.outputs import weighs
+from heliograph.report.constant_sensor_error import MOST, ConstantError, find_constant_error
+from heliograph.report.sensor_output_health import weighs
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.record import Record

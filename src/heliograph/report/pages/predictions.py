@@ -9,9 +9,17 @@ from matplotlib.figure import Figure
 import heliograph
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
-from heliograph.report.health import Health
-from heliograph.report.innovations import BAND, COLOURS, LOOK, MOST, choose_picture, label_time_axis, say_not_drawn
+from heliograph.report.innovations_section import (
+    BAND,
+    COLOURS,
+    LOOK,
+    MOST,
+    choose_picture,
+    label_time_axis,
+    say_not_drawn,
+)
 from heliograph.report.pages.page import Picture, Section, Text
+from heliograph.report.recording_diagnosis import Health
 
 PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 

@@ -18,10 +18,10 @@ from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.counted_shares import round_to as round_to
-from heliograph.report.expected_squares import compare_squares, expect_squares
+from heliograph.report.expected_squared_innovations import compare_squares, expect_squares
 from heliograph.report.innovation_medians import find_law_medians
-from heliograph.report.repeated_values import NO_LAW, HeldValue, NoiseLaw, find_held_value, list_noise_laws
-from heliograph.report.results import Json
+from heliograph.report.results_folder import Json
+from heliograph.report.stuck_sensors import NO_LAW, HeldValue, NoiseLaw, find_held_value, list_noise_laws
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

@@ -18,9 +18,9 @@ from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
-from heliograph.report.compared_nodes import compare_nodes
-from heliograph.report.constant_error import ConstantError, find_constant_error
-from heliograph.report.doubts import (
+from heliograph.report.constant_sensor_error import ConstantError, find_constant_error
+from heliograph.report.disagreeing_nodes import compare_nodes
+from heliograph.report.doubt_sentences import (
     say_apart,
     say_constant_error,
     say_declared,
@@ -29,11 +29,17 @@ from heliograph.report.doubts import (
     say_underconfident,
     say_what_to_do,
 )
-from heliograph.report.expected_squares import compare_squares, expect_squares
-from heliograph.report.forecasts import Forecasts, Residuals
-from heliograph.report.outputs import ListeningFilter, OutputHealth, judge_outputs_of_filter, list_listeners, weighs
-from heliograph.report.repeated_values import HeldValue
-from heliograph.report.time_unit import doubt_time_unit
+from heliograph.report.expected_squared_innovations import compare_squares, expect_squares
+from heliograph.report.forecast_figures import Forecasts, Residuals
+from heliograph.report.sensor_output_health import (
+    ListeningFilter,
+    OutputHealth,
+    judge_outputs_of_filter,
+    list_listeners,
+    weighs,
+)
+from heliograph.report.stuck_sensors import HeldValue
+from heliograph.report.wrong_time_unit import doubt_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.network import Network

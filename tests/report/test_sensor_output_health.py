@@ -72,7 +72,7 @@ def test_the_page_and_the_last_lines_have_the_same_numbers(recorded, tmp_path, f
     assert numbers["robust"]["left"]["down_weighted"] == left.down_weighted and numbers["robust"]["left"]["to_blame"]
     assert "down_weighted" not in numbers["plain"]["left"] and np.isclose(numbers["plain"]["left"]["received"], left[1])
     # The command prints a line for each output of the robust filter, and none of the other.
-    (tmp_path / "net.py").write_text("from tests.report.test_outputs import NETWORK as network\n")
+    (tmp_path / "net.py").write_text("from tests.report.test_sensor_output_health import NETWORK as network\n")
     rows = "\n".join(",".join(["" if np.isnan(x) else repr(float(x)) for x in row]) for row in recorded)
     times = [f"{k},{row}" for k, row in enumerate(rows.split("\n"))]
     (tmp_path / "data.csv").write_text("\n".join(["time,left,right", *times]) + "\n")

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import Bool, Float
-from heliograph.report.outputs import round_to
+from heliograph.report.sensor_output_health import round_to
 
 SMALL = 1e-3  # of an innovation's deviation: the step by which responses are found
 MOST = 24  # outputs of which each is tried

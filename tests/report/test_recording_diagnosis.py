@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.report import examine
-from heliograph.report.repeated_values import find_held_value
+from heliograph.report.stuck_sensors import find_held_value
 
 PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0, states=["x"])
 SENSOR = hg.LinearSensor([[1.0]], 1.0, outputs=["y"])

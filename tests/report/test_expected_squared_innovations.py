@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report.health import examine
+from heliograph.report.recording_diagnosis import examine
 
 ROWS = 1000
 SENSOR = hg.LinearSensor([[1.0]], [[0.1]], outputs=["y"])

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from heliograph.report.constant_error import ConstantError
-from heliograph.report.repeated_values import HeldValue
+from heliograph.report.constant_sensor_error import ConstantError
+from heliograph.report.stuck_sensors import HeldValue
 from heliograph.simulation.declared.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
 

@@ -6,7 +6,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from heliograph.report.figures import make_stacked_panels, place_legend_above
-from heliograph.report.innovations import LOOK, label_time_axis
+from heliograph.report.innovations_section import LOOK, label_time_axis
 from heliograph.simulation.results.record import Record
 
 PREFIX = "modes_"  # of the names of figures, before that of a node's estimates

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 
 from heliograph.disk.quoting import visible
 from heliograph.report.figures import COLOURS, MUTED
-from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Table, Text
+from heliograph.report.sensor_output_health import round_to
 from heliograph.simulation.results.record import Record
 
 if TYPE_CHECKING:

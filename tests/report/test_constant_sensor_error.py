@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.report.health import examine
+from heliograph.report.recording_diagnosis import examine
 
 PLANT = hg.LinearPlant([[1.0, 0.1], [0.0, 1.0]], np.diag([1e-4, 1e-2]), [0.0, 0.0], np.eye(2), states=["x", "v"])
 ROWS = 400

@@ -10,10 +10,10 @@ from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.model.checks.refusals import WORDS
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, VERMILION, WIDTH
-from heliograph.report.health import Health
-from heliograph.report.innovations import LOOK, MOST, label_time_axis, say_not_drawn
-from heliograph.report.outputs import round_to
+from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, say_not_drawn
 from heliograph.report.pages.page import Picture, Table, Text
+from heliograph.report.recording_diagnosis import Health
+from heliograph.report.sensor_output_health import round_to
 from heliograph.simulation.network import Network
 
 
