@@ -3,8 +3,8 @@
 import pytest
 
 from heliograph import cli
-from heliograph.campaign.failures import Failure
-from heliograph.campaign.page import draw_campaign_figures, write_campaign_page
+from heliograph.campaign.failed_chunks import Failure
+from heliograph.campaign.report_page import draw_campaign_figures, write_campaign_page
 from heliograph.campaign.summary import read_summary
 from heliograph.report.progress import Countdown, format_remaining
 from tests.campaign.example import CAMPAIGN, write

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.campaign.plan import Campaign, Chunk, parse_campaign, versions
-from heliograph.campaign.store import (
+from heliograph.campaign.definition import Campaign, Chunk, parse_campaign, versions
+from heliograph.campaign.zarr_store import (
     AxisLabels,
     NetworkDescription,
     check_within,

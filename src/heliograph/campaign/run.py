@@ -7,11 +7,12 @@ from pathlib import Path
 
 from typing_extensions import TypeAliasType
 
-from heliograph.campaign.engines import Engine, start_engine
-from heliograph.campaign.failures import Failure, describe_failure, write_failures
+from heliograph.campaign.definition import Campaign
+from heliograph.campaign.failed_chunks import Failure, describe_failure, write_failures
+from heliograph.campaign.job_engines import Engine, start_engine
 from heliograph.campaign.jobs import Job, Reply
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import (
+from heliograph.campaign.summary import SUMMARY, write_summary
+from heliograph.campaign.zarr_store import (
     STORE,
     NetworkDescription,
     check_same_campaign,
@@ -26,8 +27,7 @@ from heliograph.campaign.store import (
     unite_labels,
     write_claims,
 )
-from heliograph.campaign.summary import SUMMARY, write_summary
-from heliograph.disk.whole_file import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
+from heliograph.disk.atomic_files import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
 from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable
 

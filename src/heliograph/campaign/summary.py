@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, get_type_hints
 import numpy as np
 import zarr
 
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import CLAIM, STORE, find_done_chunks, read_labels
-from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import name_path_in_errors, replace
+from heliograph.campaign.definition import Campaign
+from heliograph.campaign.zarr_store import CLAIM, STORE, find_done_chunks, read_labels
+from heliograph.disk.atomic_files import name_path_in_errors, replace
+from heliograph.disk.quoted_text import quote_for_cell, unquote_cell
 from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import choose_results_folder, measured_option, number, path_option
-from heliograph.cli.reading import ReadingOptions, read_measured
+from heliograph.cli.app_and_option_types import choose_results_folder, measured_option, number, path_option
+from heliograph.cli.measured_data import ReadingOptions, read_measured
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def backtest(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.numerics.check import check_count, fail
     from heliograph.report.results_folder import write_results
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import path_option
-from heliograph.cli.worth import WorthOptions, compute_worth, describe_worth, write_figure
+from heliograph.cli.app_and_option_types import path_option
+from heliograph.cli.sensor_worth import WorthOptions, compute_worth, describe_worth, write_figure
 
 DOUBTFUL = 1
 
@@ -47,7 +47,7 @@ def check(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
     from heliograph.simulation.description.doubts import doubts_before_data

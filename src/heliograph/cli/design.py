@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from heliograph.cli.app import choose_results_folder, path_option
+from heliograph.cli.app_and_option_types import choose_results_folder, path_option
 
 if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
@@ -27,7 +27,7 @@ def design(
     task:
         A TOML file that names the network, the budget or the target error, and what is free.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.design_file import read_design
     from heliograph.report.results_folder import write_results
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import path_option
+from heliograph.cli.app_and_option_types import path_option
 
 if TYPE_CHECKING:
     from heliograph.export.c_files import Cost, Exported
@@ -37,9 +37,9 @@ def export(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.export.c_files import PRECISIONS, check_source_path, measure_cost, write_filter
-    from heliograph.export.text import find_claim
+    from heliograph.export.c_text import find_claim
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import measured_option, number, path_option
-from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
-from heliograph.cli.stopping import GentleStop
+from heliograph.cli.app_and_option_types import measured_option, number, path_option
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
+from heliograph.cli.stop_signals import GentleStop
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def _read_data(
     reading: ReadingOptions,
 ) -> MeasuredPlant:
     """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
 

@@ -29,7 +29,7 @@ def inspect(
         JSON, a log, a table) or a folder of these, of which each is a topic, or the URL of a broker: mqtt://, nats://
         or opc.tcp://.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.source_suggestions import suggest_sources
     from heliograph.numerics.check import TINY, scalar
 
@@ -83,7 +83,7 @@ def _print_table(topics: "dict[str, Topic]") -> None:
     import rich.markup
     import rich.table
 
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
 
     table = rich.table.Table(
         "topic", "type", "messages", "rate", "largest gap", "late (s): median, 95 %, most", box=None

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import measured_option, number, path_option
-from heliograph.cli.reading import ReadingOptions, open_measured, read_events, read_rows
+from heliograph.cli.app_and_option_types import measured_option, number, path_option
+from heliograph.cli.measured_data import ReadingOptions, open_measured, read_events, read_rows
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _read_events(
 
     A recording has events, or rows of time, which are those of one plant. Warnings and notes go to the standard error.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.serving.brokers.replay import events_of_recording
 
@@ -104,7 +104,7 @@ def _read_events(
         return
     import numpy as np
 
-    from heliograph.cli.reading import describe_unread
+    from heliograph.cli.measured_data import describe_unread
 
     lines_on_digits: list[str] = []
     if table.dated:

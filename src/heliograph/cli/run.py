@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.filtered_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
-from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
-from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured
+from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
+from heliograph.cli.filter_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured
+from heliograph.cli.run_in_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
 def _print_lines(warnings: list[str], summary: list[str]) -> None:
     """Print warnings to the standard error, and the summary to the standard output."""
 
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
 
     for line in warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
@@ -199,7 +199,7 @@ def _check_output_places(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
 ) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written."""
-    from heliograph.disk.whole_file import FORMATS, check_writable
+    from heliograph.disk.atomic_files import FORMATS, check_writable
     from heliograph.files.logs.log import PACKAGES
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
@@ -221,7 +221,7 @@ def _check_output_places(
         if isinstance(measurements, Path) and out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.disk.whole_file import check_replaceable
+        from heliograph.disk.atomic_files import check_replaceable
         from heliograph.report.results_folder import SUMMARY
 
         check_replaceable(report, SUMMARY)

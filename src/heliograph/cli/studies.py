@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import choose_results_folder, number, path_option
+from heliograph.cli.app_and_option_types import choose_results_folder, number, path_option
 
 GROUP = "heliograph.studies"
 PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was

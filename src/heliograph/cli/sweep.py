@@ -6,7 +6,7 @@ from typing import Annotated
 import rich.console
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, path_option
+from heliograph.cli.app_and_option_types import number, path_option
 
 
 def sweep(
@@ -26,7 +26,7 @@ def sweep(
     campaign:
         A TOML file that names the network's function, the settings, and how many runs of each.
     """
-    from heliograph.campaign.command import sweep
+    from heliograph.campaign.sweep_command import sweep
 
     return sweep(campaign, out, workers, scheduler, setting, chunk)
 
@@ -38,8 +38,8 @@ def explore(
     out: Annotated[Path, path_option("Folder for explore.html.")],
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
-    from heliograph.campaign.explore import write_explorer
-    from heliograph.disk.whole_file import check_folder_writable
+    from heliograph.campaign.explore_page import write_explorer
+    from heliograph.disk.atomic_files import check_folder_writable
 
     check_folder_writable(out)
     page = write_explorer(results, out)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
-from heliograph.disk.whole_file import check_writable, whole_files
-from heliograph.export.program import RESERVED, Real, write_step_program
-from heliograph.export.text import CText, TextOptions, write_c_text
-from heliograph.export.window import check_window
+from heliograph.disk.atomic_files import check_writable, whole_files
+from heliograph.export.c_text import CText, TextOptions, write_c_text
+from heliograph.export.late_measurement_window import check_window
+from heliograph.export.step_program import RESERVED, Real, write_step_program
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first

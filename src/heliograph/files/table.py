@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.disk.whole_file import FORMATS, format_of
+from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
 from heliograph.files.parquet_columns import read_parquet_blocks

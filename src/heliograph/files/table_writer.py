@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, TextIO
 import msgspec
 import numpy as np
 
-from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import check_writable, format_of, whole_file
+from heliograph.disk.atomic_files import check_writable, format_of, whole_file
+from heliograph.disk.quoted_text import quote_for_cell, unquote_cell
 from heliograph.files.text.dialects import check_distinct
 from heliograph.numerics.times.dates import format_dates
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.report.figures import COLOURS, MUTED
 from heliograph.report.pages.page import Table, Text
 from heliograph.report.sensor_output_health import round_to

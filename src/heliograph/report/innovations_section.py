@@ -8,7 +8,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, make_stacked_panels
 from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text
 from heliograph.report.recording_diagnosis import FilterHealth, Health

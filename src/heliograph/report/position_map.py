@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, place_legend_above
 from heliograph.simulation.results.record import Record
 

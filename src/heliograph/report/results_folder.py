@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from heliograph.disk.whole_file import check_replaceable, whole_folder
+from heliograph.disk.atomic_files import check_replaceable, whole_folder
 from heliograph.numerics.process.extras import check_installed
 from heliograph.report.progress import Advance, progress
 

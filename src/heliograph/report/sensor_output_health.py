@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.fusion.network_fusion import Fusion

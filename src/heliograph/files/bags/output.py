@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.whole_file import check_writable, whole_file
+from heliograph.disk.atomic_files import check_writable, whole_file
 from heliograph.model.estimate import Claim, is_sound
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable

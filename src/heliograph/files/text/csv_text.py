@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from heliograph.disk.quoting import unquote_cell
+from heliograph.disk.quoted_text import unquote_cell
 from heliograph.files.text.dialects import (
     NO_VALUE,
     check_header,

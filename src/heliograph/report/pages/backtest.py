@@ -9,7 +9,7 @@ import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
 from heliograph.report.results_folder import Json, Results

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.numerics.counted_shares import round_to
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign

@@ -10,7 +10,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.likelihood_maximum import Row

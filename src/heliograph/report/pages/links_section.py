@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.model.checks.refusals import WORDS
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, VERMILION, WIDTH

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import heliograph
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
 from heliograph.report.innovations_section import (
     BAND,

@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import instance
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
 from heliograph.report.forecast_figures import draw_forecasts, forecast_tables

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.numerics.types import units_in
 from heliograph.planning.sensor_worth import SensorWorth
 from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, make_stacked_panels

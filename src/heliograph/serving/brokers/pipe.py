@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from heliograph.disk.whole_file import name_path_in_errors
+from heliograph.disk.atomic_files import name_path_in_errors
 from heliograph.files.text.text_stream import TextStream
 from heliograph.serving.brokers.transport import LOG, Batch, acknowledge_nothing
 from heliograph.serving.message import LONGEST, Payload

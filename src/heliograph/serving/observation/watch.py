@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from prometheus_client import CollectorRegistry
 from pydantic_core import from_json
 
-from heliograph.disk.quoting import join_names
+from heliograph.disk.quoted_text import join_names
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.checks.refusals import OF_NODES, WORDS
 from heliograph.model.estimate import Claim

@@ -4,12 +4,17 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import heliograph
-from heliograph.disk.quoting import visible
-from heliograph.export.functions import declare_innovation, explain_separate_functions, list_signatures, write_functions
-from heliograph.export.layout import lay_out_array, lay_out_struct
-from heliograph.export.program import Real, StepProgram
-from heliograph.export.single_precision import explain_ranges, explain_rounding
-from heliograph.export.window import WindowText, write_window
+from heliograph.disk.quoted_text import visible
+from heliograph.export.c_functions import (
+    declare_innovation,
+    explain_separate_functions,
+    list_signatures,
+    write_functions,
+)
+from heliograph.export.late_measurement_window import WindowText, write_window
+from heliograph.export.single_precision_notes import explain_ranges, explain_rounding
+from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.struct_layout import lay_out_array, lay_out_struct
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first

@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.campaign.failures import FAILURES, Failure, read_failures
-from heliograph.campaign.plan import BITWISE, Campaign, Setting, canonical
-from heliograph.campaign.store import list_parameter_values
+from heliograph.campaign.definition import BITWISE, Campaign, Setting, canonical
+from heliograph.campaign.failed_chunks import FAILURES, Failure, read_failures
 from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.campaign.zarr_store import list_parameter_values
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
 from heliograph.report.pages.page import Block, Code, Page, Picture, Points, Section, Table, Text
 

@@ -82,7 +82,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 def _check_figure(figure: Path) -> None:
     """Raise the error that writing the figure would raise."""
-    from heliograph.disk.whole_file import check_writable
+    from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.extras import check_installed
 
     check_installed(["matplotlib"])
@@ -153,7 +153,7 @@ def write_figure(worth: "SensorWorth", options: WorthOptions) -> None:
     """Write the figure of what sensors are worth, if one is asked for."""
     if options.figure is None:
         return
-    from heliograph.disk.whole_file import whole_file
+    from heliograph.disk.atomic_files import whole_file
     from heliograph.report.figures import png, svg
     from heliograph.report.pages.sensor_worth import draw_worth
 

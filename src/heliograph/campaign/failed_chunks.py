@@ -5,9 +5,9 @@ import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from heliograph.campaign.definition import Campaign, Setting
 from heliograph.campaign.jobs import Job, Reply
-from heliograph.campaign.plan import Campaign, Setting
-from heliograph.disk.whole_file import name_path_in_errors, replace
+from heliograph.disk.atomic_files import name_path_in_errors, replace
 
 FAILURES = "failures.json"
 

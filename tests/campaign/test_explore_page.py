@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from heliograph import cli
-from heliograph.campaign import explore, load_campaign, open_results
-from heliograph.campaign.explore import StateScore, list_state_scores
+from heliograph.campaign import explore_page, load_campaign, open_results
+from heliograph.campaign.explore_page import StateScore, list_state_scores
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import Score, read_summary
 from tests.campaign.example import CAMPAIGN, NETWORK, write
@@ -35,7 +35,7 @@ def hostile(campaign, scores):
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore.write_explore_page(campaign, there)
+    return explore_page.write_explore_page(campaign, there)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def explored(campaign, scores):
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore.write_explore_page(
+    return explore_page.write_explore_page(
         campaign, there, lambda settings, steps: [d for d in results if d.setting in settings]
     )
 
@@ -99,8 +99,8 @@ def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
 
 @pytest.mark.slow
 def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
-    monkeypatch.setattr(explore, "ROWS", 4)
-    html = explore.write_explore_page(campaign, scores)
+    monkeypatch.setattr(explore_page, "ROWS", 4)
+    html = explore_page.write_explore_page(campaign, scores)
     assert len(data(html)[0]["columns"]["rmse"]) == 4
     assert "the first 4 of 6 settings are on this page, 4 of 6 rows" in html
 
@@ -109,9 +109,9 @@ def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
     named = replace(campaign, settings=[{"kind": ["a", 1]}, {"kind": ["b"]}])
     alike = replace(campaign, settings=[{"kind": "a"}])
     item = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
-    (table,) = data(explore.write_explore_page(named, [*item, replace(item[0], setting=1)]))
+    (table,) = data(explore_page.write_explore_page(named, [*item, replace(item[0], setting=1)]))
     assert table["x"] == "kind" and table["columns"]["kind"] == ['["a", 1]', '["b"]']
-    assert data(explore.write_explore_page(alike, item))[0]["x"] == "setting"
+    assert data(explore_page.write_explore_page(alike, item))[0]["x"] == "setting"
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ class _Worker:
             self._kill()
         if self.process is None:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "heliograph.campaign.worker"],
+                [sys.executable, "-m", "heliograph.campaign.worker_process"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 import heliograph
-from heliograph.cli.reading import MeasuredPlant, ReadingOptions
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions
 from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from heliograph.cli.filtered_plant import filter_rows
-from heliograph.cli.reading import ReadingOptions, describe_refused
+from heliograph.cli.filter_plant import filter_rows
+from heliograph.cli.measured_data import ReadingOptions, describe_refused
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.stores.address import StoreAddress
 
@@ -71,7 +71,7 @@ def run_in_blocks(
         assert isinstance(out, Path)  # as was checked
         return filter_in_blocks(network, measurements, out, options, advance)
     except AllRowsNeededError as needed:
-        from heliograph.disk.quoting import visible
+        from heliograph.disk.quoted_text import visible
 
         line = f"{measurements}: all rows are held in memory at once: {needed}"
         print("heliograph:", visible(line), file=sys.stderr)
@@ -100,7 +100,7 @@ def _check_for_needs(network: "Network", out: Path | StoreAddress | None, others
 
     `others`: the options that are given and need them.
     """
-    from heliograph.disk.whole_file import FORMATS
+    from heliograph.disk.atomic_files import FORMATS
     from heliograph.fusion.network_fusion import Fusion
 
     if given := list(others):

@@ -57,7 +57,7 @@ def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
     Raises:
         ValueError: no `--out`, or a folder that cannot be written.
     """
-    from heliograph.disk.whole_file import check_folder_writable
+    from heliograph.disk.atomic_files import check_folder_writable
     from heliograph.numerics.check import fail
 
     if out is None:

@@ -13,12 +13,12 @@ import rich.console
 import rich.table
 from rich.text import Text
 
-from heliograph.campaign.failures import FAILURES
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.read import load_campaign
+from heliograph.campaign.campaign_file import load_campaign
+from heliograph.campaign.definition import Campaign
+from heliograph.campaign.failed_chunks import FAILURES
 from heliograph.campaign.run import CampaignRun, Progress, run_campaign
 from heliograph.campaign.summary import SUMMARY, Score, read_summary, score_headers, score_row
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import fail
 from heliograph.report.progress import Countdown, show_countdown
 
@@ -50,7 +50,7 @@ def sweep(
         ValueError: as `load_campaign` and `run_campaign`; a chunk without its setting.
         ModuleNotFoundError: an extra of `sweep`, `report`, `cluster` is not installed.
     """
-    from heliograph.campaign.page import write_report  # a missing extra is reported before the work starts
+    from heliograph.campaign.report_page import write_report  # a missing extra is reported before the work starts
 
     campaign = load_campaign(path)
     only = _select_chunks(campaign, setting, chunk)

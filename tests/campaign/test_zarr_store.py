@@ -13,19 +13,19 @@ from threading import Timer
 import pytest
 
 from heliograph import cli
-from heliograph.campaign import engines
-from heliograph.campaign.engines import run_in_processes
+from heliograph.campaign import job_engines
+from heliograph.campaign.job_engines import run_in_processes
 from heliograph.campaign.jobs import Job
 from heliograph.campaign.run import run_campaign
 from heliograph.disk import lock_folder
-from heliograph.disk.whole_file import try_lock
+from heliograph.disk.atomic_files import try_lock
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
 LOCK = ".lock"
 HOLD = """
 import sys, time
 from pathlib import Path
-from heliograph.disk.whole_file import lock_folder
+from heliograph.disk.atomic_files import lock_folder
 with lock_folder(Path(sys.argv[1])) as alone:
     print(alone, flush=True)
     time.sleep(60)
@@ -137,7 +137,7 @@ def out_of_time_where_it_hangs(tmp_path, monkeypatch):
                     return
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(engines, "Timer", Hanging)
+    monkeypatch.setattr(job_engines, "Timer", Hanging)
     return requested
 
 
@@ -191,7 +191,7 @@ def test_flags_that_decide_about_bytes_are_versions(tmp_path, finished, monkeypa
 def test_no_scheduler_is_one_line(tmp_path, address, capfd, monkeypatch):
     write(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(engines, "CONNECT", 1)
+    monkeypatch.setattr(job_engines, "CONNECT", 1)
     begun = time.monotonic()
     assert cli.main(["sweep", "campaign.toml", "--out", "out", "--scheduler", address]) == cli.BAD_INPUT
     said = capfd.readouterr()
@@ -206,7 +206,7 @@ def test_a_scheduler_that_dies_is_one_line_and_the_next_run_goes_on(tmp_path, ex
     from distributed import LocalCluster
 
     monkeypatch.setenv("PAUSE", "0.1")
-    monkeypatch.setattr(engines, "CONNECT", 1)
+    monkeypatch.setattr(job_engines, "CONNECT", 1)
     campaign, out = write(tmp_path), tmp_path / "out"
     impatient = config.set({"distributed.comm.timeouts.connect": "0.5s"})  # a worker that looks for its scheduler
     with impatient, LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
@@ -233,9 +233,9 @@ def test_a_client_that_cannot_close_does_not_hide_why_the_work_ended(tmp_path, m
             raise RuntimeError("Cannot change state of expiring Timeout")
 
     monkeypatch.setattr(distributed, "Client", Ending)
-    with engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+    with job_engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
         pass
-    with pytest.raises(ValueError, match="the reason"), engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+    with pytest.raises(ValueError, match="the reason"), job_engines.run_on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
         raise ValueError("the reason")
 
 

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from heliograph.campaign.read import load_campaign
+from heliograph.campaign.campaign_file import load_campaign
 from tests.campaign.example import CAMPAIGN, NETWORK, write
 
 

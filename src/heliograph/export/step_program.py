@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.export.parts import PartOfStep, make_parts_of_step
+from heliograph.export.step_parts import PartOfStep, make_parts_of_step
 from heliograph.factors.gaussian import Gaussian, from_covariance
 from heliograph.factors.two_part_mean import SplitMeanGaussian, centred_from_covariance
 from heliograph.filters.base import AbstractFilter

@@ -6,7 +6,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.campaign import jobs
-from heliograph.campaign.engines import run_in_processes
+from heliograph.campaign.job_engines import run_in_processes
 from heliograph.campaign.jobs import Job
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import open_results, read_summary

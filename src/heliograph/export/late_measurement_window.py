@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.export.layout import Layout, lay_out_array, lay_out_struct
-from heliograph.export.program import Real, StepProgram
+from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.struct_layout import Layout, lay_out_array, lay_out_struct
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
 from heliograph.model.over_time import first

@@ -18,9 +18,9 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from heliograph.campaign.plan import Campaign, Chunk
-from heliograph.campaign.read import read_campaign
-from heliograph.disk.whole_file import sync, whole_folder
+from heliograph.campaign.campaign_file import read_campaign
+from heliograph.campaign.definition import Campaign, Chunk
+from heliograph.disk.atomic_files import sync, whole_folder
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
 

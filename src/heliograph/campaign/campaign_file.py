@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 
-from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
+from heliograph.campaign.definition import DIMENSIONS, Campaign, Setting, canonical, versions
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.check import check_count, check_seed, fail, file_path
 

@@ -11,9 +11,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import zarr
 
-from heliograph.campaign.page import describe_best_filter, draw_pictures, make_score_table
-from heliograph.campaign.plan import BITWISE, Campaign
-from heliograph.campaign.store import (
+from heliograph.campaign.definition import BITWISE, Campaign
+from heliograph.campaign.report_page import describe_best_filter, draw_pictures, make_score_table
+from heliograph.campaign.summary import SUMMARY, Score, read_summary
+from heliograph.campaign.zarr_store import (
     CLAIM,
     STORE,
     AxisLabels,
@@ -22,7 +23,6 @@ from heliograph.campaign.store import (
     read_labels,
     restore_campaign,
 )
-from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.numerics.check import fail, file_path
 from heliograph.report.pages.explore import STATIC, ExploredTable, PlotColumn, Value, explore_html
 from heliograph.report.pages.page import Page, Points, Section
