@@ -10,7 +10,7 @@ from cyclopts import App, Parameter, Token
 import heliograph
 
 if TYPE_CHECKING:
-    from heliograph.files.stores.address import StoreAddress
+    from heliograph.files.stores.store_address import StoreAddress
 
 app = App(
     name="heliograph",
@@ -82,7 +82,7 @@ def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
 
 def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
     """Convert the URL of a store to its address, any other text to a path."""
-    from heliograph.files.stores.address import is_store, parse_store
+    from heliograph.files.stores.store_address import is_store, parse_store
 
     return parse_store(tokens[0].value) if is_store(tokens[0].value) else _convert_to_path(kind, tokens)
 

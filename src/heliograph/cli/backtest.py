@@ -8,7 +8,7 @@ from cyclopts import Parameter
 import heliograph
 from heliograph.cli.app_and_option_types import choose_results_folder, measured_option, number, path_option
 from heliograph.cli.measured_data import ReadingOptions, read_measured
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable

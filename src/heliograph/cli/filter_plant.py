@@ -7,14 +7,14 @@ from urllib.parse import quote
 
 import heliograph
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     import numpy as np
 
-    from heliograph.files.estimates.forecasts import ByFilter
+    from heliograph.files.estimates.forecasts_table import ByFilter
     from heliograph.files.recording import Recording
     from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
@@ -200,9 +200,9 @@ def _write_estimates(
     if not forecasts and not predicted:
         write(record, place)
         return
-    from heliograph.files.estimates.forecasts import forecast_columns
-    from heliograph.files.estimates.table import estimate_columns
-    from heliograph.files.stores.tables import write_columns
+    from heliograph.files.estimates.estimates_table import estimate_columns
+    from heliograph.files.estimates.forecasts_table import forecast_columns
+    from heliograph.files.stores.store_tables import write_columns
     from heliograph.files.table import write_table
 
     columns = forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
@@ -246,9 +246,9 @@ def _write_lagged_estimates(
 
 def _choose_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
     """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
-    from heliograph.files.bags.output import write_bag
-    from heliograph.files.estimates.table import estimate_columns, write_estimates
-    from heliograph.files.stores.tables import write_columns
+    from heliograph.files.bags.estimates_writer import write_bag
+    from heliograph.files.estimates.estimates_table import estimate_columns, write_estimates
+    from heliograph.files.stores.store_tables import write_columns
 
     origin = _find_origin(data)
 

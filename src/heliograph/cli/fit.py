@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from heliograph.cli.app_and_option_types import measured_option, number, path_option
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
 from heliograph.cli.stop_signals import GentleStop
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable

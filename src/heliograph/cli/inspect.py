@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from heliograph.files.inspection import Topic
+    from heliograph.files.topic_inspection import Topic
 
 
 def inspect(
@@ -50,11 +50,11 @@ def inspect(
 
 def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
     """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
-    from heliograph.files.inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
-    from heliograph.files.logs.log import is_log
-    from heliograph.files.messages.folder import is_folder
-    from heliograph.files.messages.in_files import LINES
+    from heliograph.files.logs.vehicle_log import is_log
+    from heliograph.files.messages.folder_of_message_files import is_folder
+    from heliograph.files.messages.message_files import LINES
     from heliograph.files.text.text_file import kind_of
+    from heliograph.files.topic_inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
     from heliograph.report.progress import progress
 
     with progress(2) as advance:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from heliograph.files.event_table import EventTable
     from heliograph.files.recording import Recording
-    from heliograph.files.stores.address import StoreAddress
-    from heliograph.files.stores.tables import StoreTable
+    from heliograph.files.stores.store_address import StoreAddress
+    from heliograph.files.stores.store_tables import StoreTable
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
 
@@ -116,7 +116,7 @@ def open_measured(location: "Path | StoreAddress") -> "Path | StoreTable":
     """Return the path itself, or the table that a store answers."""
     if isinstance(location, Path):
         return location
-    from heliograph.files.stores.tables import ask_store
+    from heliograph.files.stores.store_tables import ask_store
 
     return ask_store(location)
 
@@ -144,11 +144,11 @@ def read_events(
     advance: "Advance",
 ) -> "EventTable | None":
     """Read the messages of a bag, a file or a store; None for rows of time."""
-    from heliograph.files.bags.bag import is_bag
-    from heliograph.files.logs.log import is_log
-    from heliograph.files.messages.folder import is_folder
-    from heliograph.files.messages.to_events import is_of_messages
-    from heliograph.files.messages.to_events import read_events as read_mapped
+    from heliograph.files.bags.ros_bag import is_bag
+    from heliograph.files.logs.vehicle_log import is_log
+    from heliograph.files.messages.folder_of_message_files import is_folder
+    from heliograph.files.messages.messages_to_events import is_of_messages
+    from heliograph.files.messages.messages_to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
 
     sources = module.get("sources")

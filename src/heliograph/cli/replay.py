@@ -11,12 +11,12 @@ from cyclopts import Parameter
 
 from heliograph.cli.app_and_option_types import measured_option, number, path_option
 from heliograph.cli.measured_data import ReadingOptions, open_measured, read_events, read_rows
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from heliograph.files.stores.tables import StoreTable
+    from heliograph.files.stores.store_tables import StoreTable
     from heliograph.live.event import Event
 
 LONGEST = 1e6  # seconds that the system sleeps at once

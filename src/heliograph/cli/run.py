@@ -12,7 +12,7 @@ from heliograph.cli.app_and_option_types import estimates_option, measured_optio
 from heliograph.cli.filter_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured
 from heliograph.cli.run_in_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -200,7 +200,7 @@ def _check_output_places(
 ) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written."""
     from heliograph.disk.atomic_files import FORMATS, check_writable
-    from heliograph.files.logs.log import PACKAGES
+    from heliograph.files.logs.vehicle_log import PACKAGES
     from heliograph.numerics.check import fail
     from heliograph.numerics.process.extras import check_installed
     from heliograph.report.results_folder import NEEDS
@@ -213,7 +213,7 @@ def _check_output_places(
         needed.append("pyarrow")
     check_installed([*needed, *(NEEDS if report is not None else ())])
     if isinstance(out, StoreAddress):
-        from heliograph.files.stores.tables import check_store
+        from heliograph.files.stores.store_tables import check_store
 
         check_store(out)
     elif out is not None:
@@ -231,7 +231,7 @@ def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
     """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
-    from heliograph.files.messages.folder import is_folder, list_used_files
+    from heliograph.files.messages.folder_of_message_files import is_folder, list_used_files
     from heliograph.files.sources.sources import Sources
     from heliograph.numerics.check import fail
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from heliograph.cli.filter_plant import filter_rows
 from heliograph.cli.measured_data import ReadingOptions, describe_refused
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from heliograph.report.progress import Advance
@@ -60,7 +60,7 @@ def run_in_blocks(
     Raises:
         ValueError: what cannot be read; very many rows that are out of order.
     """
-    from heliograph.files.messages.to_events import is_of_messages
+    from heliograph.files.messages.messages_to_events import is_of_messages
 
     if not isinstance(measurements, Path) or options.of_messages or not is_long(measurements):
         return None
@@ -137,9 +137,9 @@ def filter_in_blocks(
         AllRowsNeededError: all rows are needed at once; nothing is written.
         ValueError: what cannot be read; more than `most` rows that are out of order.
     """
-    from heliograph.files.block_order import RowsNotInBlocksError
-    from heliograph.files.estimates.table import estimate_columns
+    from heliograph.files.estimates.estimates_table import estimate_columns
     from heliograph.files.recording_blocks import RecordingBlocks
+    from heliograph.files.row_order_across_blocks import RowsNotInBlocksError
     from heliograph.files.table_writer import open_table
     from heliograph.numerics.check import InputError
 

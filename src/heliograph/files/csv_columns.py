@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.rows import EXACT, Rows
+from heliograph.files.table_rows import EXACT, Rows
+from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import CsvReader, CsvRow, parse_cell
-from heliograph.files.text.dialects import NO_VALUE
-from heliograph.files.text.plain_numbers import parse_plain_lines
+from heliograph.files.text.numeric_csv_lines import parse_plain_lines
 from heliograph.files.text.text_file import CutOffError, Progress, read_line_blocks, split_lines, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import MISSING as NAT

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.rows import Rows, convert_to_nanoseconds, numbers_of
-from heliograph.files.text.dialects import check_distinct
+from heliograph.files.table_rows import Rows, convert_to_nanoseconds, numbers_of
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import fail
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from heliograph.files.recording_cells import RowChecks, list_received_columns, list_truth_columns, read_cells
-from heliograph.files.rows import Rows
+from heliograph.files.recording_rows import KeptRows, RowsAsColumns, join_cells, keep_rows, order_rows
 from heliograph.files.table import TIME, columns_of, read_rows, write_table
-from heliograph.files.table_rows import KeptRows, RowsAsColumns, join_cells, keep_rows, order_rows
+from heliograph.files.table_rows import Rows
 from heliograph.files.table_writer import read_back_name
 from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
@@ -22,7 +22,7 @@ from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
-    from heliograph.files.stores.tables import StoreTable
+    from heliograph.files.stores.store_tables import StoreTable
 
 
 @readable

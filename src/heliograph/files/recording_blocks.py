@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.block_order import BlockOrder
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.recording import Recording, RowReader
-from heliograph.files.rows import Rows
+from heliograph.files.row_order_across_blocks import BlockOrder
 from heliograph.files.table import read_row_blocks
+from heliograph.files.table_rows import Rows
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network

@@ -6,8 +6,8 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from heliograph.files.recording_rows import RowsAsColumns
 from heliograph.files.table import TIME
-from heliograph.files.table_rows import RowsAsColumns
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph.files.inspection import Topic
+from heliograph.files.topic_inspection import Topic
 
 DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
 FEW = 6  # fields that a suggestion lists

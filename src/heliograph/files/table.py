@@ -11,9 +11,9 @@ from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
 from heliograph.files.parquet_columns import read_parquet_blocks
-from heliograph.files.rows import Rows, convert_to_nanoseconds, join_rows, numbers_of
+from heliograph.files.table_rows import Rows, convert_to_nanoseconds, join_rows, numbers_of
 from heliograph.files.table_writer import open_table
-from heliograph.files.text.dialects import check_distinct
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress, kind_of
 from heliograph.numerics.check import fail, file_path, show_value, table
 from heliograph.numerics.masked import fill_masked, is_absent

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.disk.atomic_files import check_writable, format_of, whole_file
 from heliograph.disk.quoted_text import quote_for_cell, unquote_cell
-from heliograph.files.text.dialects import check_distinct
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.numerics.times.dates import format_dates
 
 if TYPE_CHECKING:

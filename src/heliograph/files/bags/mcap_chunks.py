@@ -7,7 +7,7 @@ from itertools import accumulate
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from heliograph.files.bags.message_layout import RawMessage
+from heliograph.files.bags.batch_decoder import RawMessage
 
 if TYPE_CHECKING:  # an extra
     from rosbags.highlevel import AnyReader

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.logs.log import Log, Series, Wanted, merge_series
 from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.logs.vehicle_log import Log, Series, Wanted, merge_series
 from heliograph.numerics.check import error_text, fail
 
 if TYPE_CHECKING:

@@ -7,19 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.availability import DeviceStatuses
-from heliograph.files.sources.clocks import TopicClocks
-from heliograph.files.sources.derived import Computed, ZeroIfAbsent
-from heliograph.files.sources.fields import (
+from heliograph.files.device_availability import DeviceStatuses
+from heliograph.files.sources.computed_values import Computed, ZeroIfAbsent
+from heliograph.files.sources.json_field import Field, Source
+from heliograph.files.sources.message_fields import (
     MissingFieldError,
     convert_count,
     convert_number,
     field_at,
     match_topic,
 )
-from heliograph.files.sources.json_field import Field, Source
-from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.sources.several_senders import SenderCounter
+from heliograph.files.sources.mixed_sender_detection import SenderCounter
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.topic_clocks import TopicClocks
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusals import RefusedError
 from heliograph.model.plant import TIME_STEP

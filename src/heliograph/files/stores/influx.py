@@ -15,8 +15,8 @@ from urllib.parse import urlencode, urlsplit
 
 import numpy as np
 
-from heliograph.files.stores.address import StoreAddress
-from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_sql_rows, shorten_line
+from heliograph.files.stores.influx_responses import read_flux, read_influxql, read_sql_rows, shorten_line
+from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
 PORT = 8086

@@ -7,7 +7,7 @@ import numpy as np
 import psycopg
 from psycopg import sql
 
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
 LONGEST = 63  # bytes of a column's name; what is longer would be cut

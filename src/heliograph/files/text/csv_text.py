@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from heliograph.disk.quoted_text import unquote_cell
-from heliograph.files.text.dialects import (
+from heliograph.files.text.csv_dialects import (
     NO_VALUE,
     check_header,
     guess_meaning_of_cell,

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from heliograph.files.messages.in_files import FileMessage, convert_line, decode_document
-from heliograph.files.messages.own_form import OwnReader, is_own
+from heliograph.files.messages.message_files import FileMessage, convert_line, decode_document
+from heliograph.files.messages.own_format import OwnReader, is_own
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder

@@ -4,7 +4,7 @@ import asyncio
 import threading
 import time
 
-from heliograph.files.inspection import Topic, note_payload
+from heliograph.files.topic_inspection import Topic, note_payload
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.url import Address
 

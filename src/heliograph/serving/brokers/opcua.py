@@ -14,7 +14,7 @@ from asyncua import Client, Node, ua
 from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
-from heliograph.files.inspection import Topic, note_payload
+from heliograph.files.topic_inspection import Topic, note_payload
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.pipe import Pipe

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.csv_columns import CsvColumnReader
-from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, typed_cells
-from heliograph.files.messages.own_form import NODE, OWN, SEQUENCE, OwnReader
+from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_row, typed_cells
+from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnReader
 from heliograph.files.recording import RowReader
-from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.table_rows import RowsAsColumns, join_cells
+from heliograph.files.recording_rows import RowsAsColumns, join_cells
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.text.csv_dialects import COMMENTS, names_in
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
-from heliograph.files.text.dialects import COMMENTS, names_in
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.replay import check_time_steps, encode_event, events_of_recording, row_events

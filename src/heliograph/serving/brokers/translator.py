@@ -5,9 +5,9 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from heliograph.files.messages.in_files import FileMessage, message_name
-from heliograph.files.sources.fields import decode_json, parse_arrival
-from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.messages.message_files import FileMessage, message_name
+from heliograph.files.sources.message_fields import decode_json, parse_arrival
+from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.model.checks.refusals import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from heliograph.files.sources.fields import decode_items, decode_json, fail_of_doubled, parse_number
+from heliograph.files.sources.message_fields import decode_items, decode_json, fail_of_doubled, parse_number
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
-from heliograph.files.text.dialects import check_distinct
 from heliograph.files.text.text_file import is_text, kind_of, open_text, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import parse_instant

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
 SAID = 200  # characters of what a server says

@@ -8,11 +8,11 @@ import numpy as np
 
 from heliograph.files.event_columns import counts_losses
 from heliograph.files.event_table import EventTable
-from heliograph.files.messages.in_files import FileMessage, read_parquet_names
-from heliograph.files.sources.fields import convert_name
-from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.messages.message_files import FileMessage, read_parquet_names
+from heliograph.files.sources.message_fields import convert_name
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import read_csv_header
-from heliograph.files.text.dialects import NO_VALUE
 from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.logs.log_sources import STAMP
-from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.messages.message_files import FileMessage
 from heliograph.numerics.check import InputError
 from heliograph.numerics.types import Float
 

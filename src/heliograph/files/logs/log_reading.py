@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
 
-from heliograph.files.logs.can_frames import open_frames
-from heliograph.files.logs.log import MDF, ULOG, Log, Wanted, list_logs
+from heliograph.files.logs.can_frames_to_messages import open_frames
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.logs.mdf import open_mdf
 from heliograph.files.logs.ulog import open_ulog
-from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.logs.vehicle_log import MDF, ULOG, Log, Wanted, list_logs
+from heliograph.files.messages.message_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, fail
 

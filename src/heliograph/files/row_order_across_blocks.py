@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from heliograph.files.recording_rows import RowsAsColumns
 from heliograph.files.table import TIME
-from heliograph.files.table_rows import RowsAsColumns
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.row_order import SECOND, YEAR

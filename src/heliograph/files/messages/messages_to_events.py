@@ -3,13 +3,13 @@
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from heliograph.files.bags.bag import Progress, is_bag, parts_of, read_bag
-from heliograph.files.bags.mcap_messages import holds_messages, read_mcap_messages
+from heliograph.files.bags.mcap_json_and_protobuf import holds_messages, read_mcap_messages
+from heliograph.files.bags.ros_bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
-from heliograph.files.logs.log import is_log
-from heliograph.files.logs.reading import read_log
-from heliograph.files.messages.folder import is_folder, list_left_files, name_topic, read_folder
-from heliograph.files.messages.in_files import (
+from heliograph.files.logs.log_reading import read_log
+from heliograph.files.logs.vehicle_log import is_log
+from heliograph.files.messages.folder_of_message_files import is_folder, list_left_files, name_topic, read_folder
+from heliograph.files.messages.message_files import (
     TOPIC,
     FileMessage,
     decode_payload,
@@ -18,12 +18,12 @@ from heliograph.files.messages.in_files import (
     read_message_file,
     table_has_topics,
 )
-from heliograph.files.messages.own_form import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
-from heliograph.files.sources.fields import parse_arrival
-from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.messages.own_format import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
+from heliograph.files.sources.message_fields import parse_arrival
+from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
-from heliograph.files.stores.address import is_store, parse_store
-from heliograph.files.stores.tables import StoreTable, ask_store
+from heliograph.files.stores.store_address import is_store, parse_store
+from heliograph.files.stores.store_tables import StoreTable, ask_store
 from heliograph.files.text.text_file import CutOffError, kind_of
 from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network

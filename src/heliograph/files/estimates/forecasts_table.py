@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.estimates.table import estimate_columns, make_header
+from heliograph.files.estimates.estimates_table import estimate_columns, make_header
 from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, show_value

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from typing_extensions import TypeAliasType
 
-from heliograph.files.sources.fields import decode_json, field_at, match_topic
+from heliograph.files.sources.message_fields import decode_json, field_at, match_topic
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.module import readable
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from heliograph.files.bags.bag import is_bag
-from heliograph.files.messages.in_files import LINES, FileMessage, message_name, read_message_file
+from heliograph.files.bags.ros_bag import is_bag
+from heliograph.files.messages.message_files import LINES, FileMessage, message_name, read_message_file
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import kind_of
 from heliograph.numerics.check import InputError, fail

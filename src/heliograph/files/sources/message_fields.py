@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from heliograph.files.text.dialects import NO_VALUE
+from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.live.event import check_63_bits
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import UNITS, parse_dates, parse_instant

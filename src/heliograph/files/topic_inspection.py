@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from heliograph.files.bags.bag import OFTEN, Progress, list_fields, open_bag, parts_of
 from heliograph.files.bags.mcap_chunks import read_messages_in_order as bag_messages
-from heliograph.files.bags.mcap_messages import holds_messages, read_mcap_messages
+from heliograph.files.bags.mcap_json_and_protobuf import holds_messages, read_mcap_messages
+from heliograph.files.bags.ros_bag import OFTEN, Progress, list_fields, open_bag, parts_of
+from heliograph.files.logs.log_reading import open_logs
 from heliograph.files.logs.log_sources import LogSources
-from heliograph.files.logs.reading import open_logs
-from heliograph.files.messages.folder import list_files
-from heliograph.files.messages.in_files import (
+from heliograph.files.messages.folder_of_message_files import list_files
+from heliograph.files.messages.message_files import (
     decode_payload,
     is_message_file,
     message_name,
     read_message_file,
 )
-from heliograph.files.sources.fields import TimeUnit, convert_time, decode_json, is_stamp, parse_arrival
+from heliograph.files.sources.message_fields import TimeUnit, convert_time, decode_json, is_stamp, parse_arrival
 from heliograph.numerics.check import InputError, error_text, fail
 from heliograph.numerics.times.dates import UNITS, looks_like_date
 

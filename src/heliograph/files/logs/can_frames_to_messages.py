@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from heliograph.files.logs.log import DIGITS, Log, Wanted
 from heliograph.files.logs.log_sources import STAMP, LogSources
-from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.logs.vehicle_log import DIGITS, Log, Wanted
+from heliograph.files.messages.message_files import FileMessage
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, error_text, fail
 

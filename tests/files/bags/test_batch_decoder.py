@@ -9,7 +9,7 @@ pytest.importorskip("rosbags")
 from rosbags.interfaces import Nodetype
 
 import heliograph as hg
-from heliograph.files.bags.message_layout import Decoder
+from heliograph.files.bags.batch_decoder import Decoder
 from tests.files import bags
 
 KINDS = bags.STORE.types
@@ -82,7 +82,7 @@ def test_many_at_once_are_bit_for_bit_those_one_by_one(tmp_path, monkeypatch):
         return used[-1]
 
     monkeypatch.setattr(Decoder, "append_events", counted)
-    monkeypatch.setattr("heliograph.files.bags.bag.OFTEN", 400)
+    monkeypatch.setattr("heliograph.files.bags.ros_bag.OFTEN", 400)
     table = hg.files.read_messages(path, NETWORK, SOURCES)
     assert len(table) > 3000 and used == [True] * 8
     monkeypatch.setattr(Decoder, "append_events", lambda decoder, batch, table: False)

@@ -10,9 +10,9 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from heliograph.files.bags.bag import DATA_END, FOOTER, MAGIC, DamageError
 from heliograph.files.bags.protobuf import Schema
-from heliograph.files.messages.in_files import FileMessage
+from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, DamageError
+from heliograph.files.messages.message_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, error_text, fail

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.estimates.table import estimate_columns
-from heliograph.files.messages.in_files import FileMessage, convert_row
-from heliograph.files.rows import Rows
-from heliograph.files.stores.address import INFLUX, StoreAddress, parse_store
+from heliograph.files.estimates.estimates_table import estimate_columns
+from heliograph.files.messages.message_files import FileMessage, convert_row
+from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
 from heliograph.files.table import TIME, columns_of
+from heliograph.files.table_rows import Rows
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.process.extras import check_installed
 from heliograph.simulation.results.record import Record
