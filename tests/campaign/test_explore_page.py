@@ -35,7 +35,7 @@ def hostile(campaign, scores):
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore_page.write_explore_page(campaign, there)
+    return explore_page.make_explore_page_html(campaign, there)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def explored(campaign, scores):
     there = [
         score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
     ]
-    return explore_page.write_explore_page(
+    return explore_page.make_explore_page_html(
         campaign, there, lambda settings, steps: [d for d in results if d.setting in settings]
     )
 
@@ -100,7 +100,7 @@ def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
 @pytest.mark.slow
 def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
     monkeypatch.setattr(explore_page, "ROWS", 4)
-    html = explore_page.write_explore_page(campaign, scores)
+    html = explore_page.make_explore_page_html(campaign, scores)
     assert len(data(html)[0]["columns"]["rmse"]) == 4
     assert "the first 4 of 6 settings are on this page, 4 of 6 rows" in html
 
@@ -109,9 +109,9 @@ def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
     named = replace(campaign, settings=[{"kind": ["a", 1]}, {"kind": ["b"]}])
     alike = replace(campaign, settings=[{"kind": "a"}])
     item = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
-    (table,) = data(explore_page.write_explore_page(named, [*item, replace(item[0], setting=1)]))
+    (table,) = data(explore_page.make_explore_page_html(named, [*item, replace(item[0], setting=1)]))
     assert table["x"] == "kind" and table["columns"]["kind"] == ['["a", 1]', '["b"]']
-    assert data(explore_page.write_explore_page(alike, item))[0]["x"] == "setting"
+    assert data(explore_page.make_explore_page_html(alike, item))[0]["x"] == "setting"
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ def interruptible():
 def test_a_second_signal_of_another_kind_leaves_the_exit_code_of_the_first():
     """Noted, then unwinding: SIGTERM and then SIGINT is 143, as SIGTERM alone."""
     with cli.GentleStop() as stop:
-        stop.only_note_next()
+        stop.note_next_signal_only()
         signal.raise_signal(signal.SIGTERM)
         assert stop.code == cli.TERMINATED
         with pytest.raises(KeyboardInterrupt):
@@ -37,5 +37,5 @@ def test_an_interrupt_raised_again_for_a_swallowed_one_leaves_the_exit_code_of_t
         return 1
 
     with cli.GentleStop() as stop:
-        assert stop.unless_stopped(swallow_the_first) is None
+        assert stop.run_unless_stopped(swallow_the_first) is None
         assert stop.code == cli.TERMINATED

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.report import examine
-from heliograph.report.stuck_sensors import find_held_value
+from heliograph.report.stuck_sensors import find_stuck_value
 
 PLANT = hg.LinearPlant([[1.0]], 0.01, [0.0], 1.0, states=["x"])
 SENSOR = hg.LinearSensor([[1.0]], 1.0, outputs=["y"])
@@ -105,11 +105,11 @@ def test_coarse_readings_of_what_rests_are_not_stuck():
     rng = np.random.default_rng(3)
     coarse = np.round(0.1 * rng.standard_normal(500) / 2) * 2
     coarse[250:] += 2
-    assert find_held_value(coarse, np.full(500, 0.01)) is None
+    assert find_stuck_value(coarse, np.full(500, 0.01)) is None
     fine = np.round(rng.standard_normal(5000), 1)
-    assert find_held_value(fine, np.full(5000, 1.0)) is None
+    assert find_stuck_value(fine, np.full(5000, 1.0)) is None
     fine[40:52] = 0.3
-    held = find_held_value(fine, np.full(5000, 1.0))
+    held = find_stuck_value(fine, np.full(5000, 1.0))
     assert held is not None and held.readings >= 12 and held.first_row <= 40
 
 
@@ -170,7 +170,7 @@ def test_right_recordings_are_seldom_named_stuck():
                         x = np.cumsum(walk * rng.standard_normal(n)) + rng.uniform(-5, 5)
                         v = np.where(rng.random(n) < share, 10.0, 1.0) * rng.standard_normal(n)
                         claimed = np.full(n, law.total + walk**2)
-                        named += find_held_value(np.round((x + v) / q) * q, claimed, law) is not None
+                        named += find_stuck_value(np.round((x + v) / q) * q, claimed, law) is not None
     assert named == 0
 
 
@@ -181,7 +181,7 @@ def test_how_long_a_sensor_stands_until_it_is_named():
     for standing, found in ((5, False), (6, True)):
         z = fine.copy()
         z[50 : 50 + standing] = 9.9
-        held = find_held_value(z, np.ones(100))
+        held = find_stuck_value(z, np.ones(100))
         assert (held is not None) == found
     assert held.readings == 6 and held.stuck == 8
 

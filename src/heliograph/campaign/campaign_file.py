@@ -73,7 +73,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
             hint = f" (closest: {close[0]!r})" if close else ""
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
     # Each reader checks its key and raises one line.
-    runs, horizon = _read_count(table, "runs", name), _read_count(table, "horizon", name)
+    runs, horizon = _read_positive_integer(table, "runs", name), _read_positive_integer(table, "horizon", name)
     return Campaign(
         text=text,
         network=_read_network(table, name),
@@ -83,7 +83,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
         # At most all runs, rounded up to a multiple of BLOCK.
-        chunk=min(_read_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
+        chunk=min(_read_chunk_size(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_read_choice(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
@@ -105,21 +105,23 @@ def _read_network(table: Mapping[str, object], name: str) -> str:
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
-        raise fail(f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _show_value(value))
+        raise fail(
+            f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _format_value_for_error(value)
+        )
     return str(value)
 
 
-def _show_value(value: object) -> str:
+def _format_value_for_error(value: object) -> str:
     """Return a value as an error shows it; "none" where the key is missing."""
     return "none" if value is None else repr(value)
 
 
-def _read_count(table: Mapping[str, object], key: str, name: str) -> int:
+def _read_positive_integer(table: Mapping[str, object], key: str, name: str) -> int:
     """Return the value of a key, a whole number from 1."""
     return check_count(f"{name}, {key}", table.get(key, "none"))
 
 
-def _read_chunk(value: object, name: str) -> int:
+def _read_chunk_size(value: object, name: str) -> int:
     """Return the runs of a chunk, a multiple of those simulated side by side."""
     count = check_count(f"{name}, chunk", value)
     if count % BLOCK:
@@ -130,7 +132,7 @@ def _read_chunk(value: object, name: str) -> int:
 def _read_timeout(value: object, name: str) -> float:
     """Return the seconds of a timeout, a positive number."""
     if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
-        raise fail(f"{name}, timeout", "a positive number of seconds", _show_value(value))
+        raise fail(f"{name}, timeout", "a positive number of seconds", _format_value_for_error(value))
     return float(value)
 
 
@@ -190,7 +192,7 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
 def _expand_grid(grid: object, name: str) -> list[Setting]:
     """Return every combination of the values of [grid]."""
     if not isinstance(grid, dict) or not grid:
-        raise fail(f"{name}, grid", "a table of lists of values by parameter", _show_value(grid))
+        raise fail(f"{name}, grid", "a table of lists of values by parameter", _format_value_for_error(grid))
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
             raise fail(f"{name}, grid.{key}", "a list of values", repr(values))

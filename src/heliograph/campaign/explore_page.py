@@ -24,7 +24,7 @@ from heliograph.campaign.zarr_store import (
     restore_campaign,
 )
 from heliograph.numerics.check import fail, file_path
-from heliograph.report.pages.explore import STATIC, ExploredTable, PlotColumn, Value, explore_html
+from heliograph.report.pages.explore import STATIC, ExploredTable, PlotColumn, Value, make_explorable_page_html
 from heliograph.report.pages.page import Page, Points, Section
 
 
@@ -162,7 +162,7 @@ NEES = PlotColumn("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
 Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[StateScore]]  # into the store: settings, steps
 
 
-def write_explorer(results: str | Path, out: str | Path) -> Path:
+def write_explore_page_file(results: str | Path, out: str | Path) -> Path:
     """Write out/explore.html, one self-contained page of the campaign in the folder `results`; return its path.
 
     Args:
@@ -179,14 +179,14 @@ def write_explorer(results: str | Path, out: str | Path) -> Path:
     campaign, scores = restore_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
-    text = write_explore_page(campaign, scores, partial(list_state_scores, folder / STORE, campaign))
+    text = make_explore_page_html(campaign, scores, partial(list_state_scores, folder / STORE, campaign))
     target.mkdir(parents=True, exist_ok=True)
     path = target / EXPLORE
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def write_explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
+def make_explore_page_html(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table.
 
     `look`: reads scores of single states from the store; without it there are none.
@@ -206,7 +206,7 @@ def write_explore_page(campaign: Campaign, scores: Sequence[Score], look: Look |
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
-    return explore_html(page, _make_tables(campaign, shown, look))
+    return make_explorable_page_html(page, _make_tables(campaign, shown, look))
 
 
 MEANING = (
@@ -246,7 +246,7 @@ def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None)
 
     Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
     """
-    scored = [_score_all_states(score) for score in scores]
+    scored = [_convert_to_state_score(score) for score in scores]
     if look is None:
         return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
@@ -260,7 +260,7 @@ def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None)
     return [_make_scores_table(campaign, scored), _make_steps_table(campaign, at_steps)]
 
 
-def _score_all_states(score: Score) -> StateScore:
+def _convert_to_state_score(score: Score) -> StateScore:
     """Return a score of all states together in the form of those of single states; it has no claimed deviation."""
     return StateScore(
         setting=score.setting,

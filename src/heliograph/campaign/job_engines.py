@@ -54,20 +54,20 @@ def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
 @contextmanager
 def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
     """Do one job at a time in each worker process; a process that dies, or that takes too long, is replaced."""
-    crew = [_Worker(campaign, store, timeout) for _ in range(workers)]
+    crew = [_WorkerProcess(campaign, store, timeout) for _ in range(workers)]
     try:
-        yield lambda jobs: _share_jobs(crew, deque(jobs))
+        yield lambda jobs: _distribute_jobs_to_workers(crew, deque(jobs))
     finally:
         for worker in crew:
             worker.stop()
 
 
-def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
+def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
     """Yield each of the waiting jobs with its reply, as they end; each worker has a thread that takes jobs for it."""
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 
-    def take_jobs(worker: _Worker) -> None:
+    def take_jobs(worker: _WorkerProcess) -> None:
         """Take jobs and do them, until none waits or the worker is stopped."""
         while not worker.stopped:
             try:
@@ -82,7 +82,7 @@ def _share_jobs(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Jo
         yield finished.get()
 
 
-class _Worker:
+class _WorkerProcess:
     """A worker process and the pipes to it: a job is a line of JSON, its reply another."""
 
     def __init__(self, campaign: str, store: Path, timeout: float):
@@ -194,10 +194,10 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
     try:
         yield lambda jobs: _submit_jobs(client, campaign, str(store), deque(jobs), timeout)
     finally:
-        _leave(client)
+        _close_client(client)
 
 
-def _leave(client: Untyped) -> None:
+def _close_client(client: Untyped) -> None:
     """Close the client of a cluster; errors are ignored, since a scheduler that is gone was reported before."""
     with suppress(OSError, RuntimeError, TimeoutError):
         client.close(timeout=CONNECT)
@@ -232,7 +232,7 @@ def _submit_jobs(
             running[future] = job
             futures.add(future)
         # Wait for any job; without one for too long, give all up.
-        future = _wait_for_next(client, futures, timeout)
+        future = _wait_for_next_future(client, futures, timeout)
         if future is None:
             client.cancel(list(running))
             yield from ((job, _make_late_reply(timeout)) for job in running.values())
@@ -240,7 +240,7 @@ def _submit_jobs(
         yield running.pop(future), _read_reply(future)
 
 
-def _wait_for_next(client: Untyped, futures: Untyped, timeout: float) -> Untyped:
+def _wait_for_next_future(client: Untyped, futures: Untyped, timeout: float) -> Untyped:
     """Return the next of the futures that is done; None after `timeout` seconds without one.
 
     Raises:

@@ -15,7 +15,7 @@ from heliograph.campaign.definition import Campaign, Chunk, parse_campaign, vers
 from heliograph.campaign.zarr_store import (
     AxisLabels,
     NetworkDescription,
-    check_within,
+    check_labels_within,
     describe_network,
     read_labels,
     restore_labels,
@@ -84,7 +84,7 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = read_labels(store)
-    check_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
+    check_labels_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,

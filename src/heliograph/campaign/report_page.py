@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.campaign.definition import BITWISE, Campaign, Setting, canonical
-from heliograph.campaign.failed_chunks import FAILURES, Failure, read_failures
-from heliograph.campaign.summary import SUMMARY, Score, score_headers, score_row
+from heliograph.campaign.failed_jobs import FAILURES, FailedJob, read_failures
+from heliograph.campaign.summary import SUMMARY, Score, make_score_cells, make_score_headers
 from heliograph.campaign.zarr_store import list_parameter_values
 from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, svg
@@ -32,11 +32,11 @@ LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an ax
 def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
     """Write the report next to the store; return its path."""
     path = out / REPORT
-    path.write_text(write_campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
+    path.write_text(make_campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
     return path
 
 
-def write_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Failure]) -> Page:
+def make_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[FailedJob]) -> Page:
     """Return the page of a campaign with its scores and failures."""
     name = Path(campaign.path).name
     computed = sum({score.setting: score.runs for score in scores}.values())
@@ -78,12 +78,12 @@ def describe_best_filter(scores: Sequence[Score]) -> str:
     return f"“{visible(name)}” has the least error in {count} of {len(compared)} cases"
 
 
-def _describe_failures(failures: Sequence[Failure]) -> str:
+def _describe_failures(failures: Sequence[FailedJob]) -> str:
     """Return in words how many jobs failed."""
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
-def _list_failures(failures: Sequence[Failure]) -> Section:
+def _list_failures(failures: Sequence[FailedJob]) -> Section:
     """Return the section that lists the jobs that failed, with their errors."""
     points = [
         f"setting {failure.setting} {failure.parameters}, runs {failure.runs[0]} to {failure.runs[1]}: {failure.error}"
@@ -104,7 +104,7 @@ def draw_pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
 
 def make_score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     """Return the first rows of the table of scores, with an explanation of its columns."""
-    rows = [[str(score.setting), *score_row(campaign, score)] for score in scores[:ROWS]]
+    rows = [[str(score.setting), *make_score_cells(campaign, score)] for score in scores[:ROWS]]
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
     caption = (
         "**RMSE**: root of the mean over runs and steps of the squared error summed over the state. **NEES / dim**: "
@@ -112,7 +112,7 @@ def make_score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
         "**±**: one standard error of the number before it, from the scatter between runs. Only finite runs "
         f"count.{more}"
     )
-    return Table(["setting", *score_headers(campaign)], rows, caption)
+    return Table(["setting", *make_score_headers(campaign)], rows, caption)
 
 
 def _explain_opening_in_python(campaign: Campaign) -> Section:

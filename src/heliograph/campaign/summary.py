@@ -160,13 +160,13 @@ def _compute_mean(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
 
 
-def score_headers(campaign: Campaign) -> list[str]:
+def make_score_headers(campaign: Campaign) -> list[str]:
     """Return the headers of the table of scores."""
     return [*campaign.parameters, "node", "filter", "claim", "RMSE", "±", "NEES / dim", "±", "finite runs"]
 
 
-def score_row(campaign: Campaign, score: Score) -> list[str]:
-    """Return the cells of a score in the table of scores, in the order of `score_headers`."""
+def make_score_cells(campaign: Campaign, score: Score) -> list[str]:
+    """Return the cells of a score in the table of scores, in the order of `make_score_headers`."""
     setting = campaign.settings[score.setting]
     return [
         *(str(setting.get(name, "")) for name in campaign.parameters),

@@ -15,9 +15,9 @@ from rich.text import Text
 
 from heliograph.campaign.campaign_file import load_campaign
 from heliograph.campaign.definition import Campaign
-from heliograph.campaign.failed_chunks import FAILURES
+from heliograph.campaign.failed_jobs import FAILURES
 from heliograph.campaign.run import CampaignRun, Progress, run_campaign
-from heliograph.campaign.summary import SUMMARY, Score, read_summary, score_headers, score_row
+from heliograph.campaign.summary import SUMMARY, Score, make_score_cells, make_score_headers, read_summary
 from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import fail
 from heliograph.report.progress import Countdown, show_countdown
@@ -129,11 +129,11 @@ def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
     """Print the first ROWS rows of the table of scores: names to the left, numbers to the right."""
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     first_number = len(campaign.parameters) + 3
-    for i, header in enumerate(score_headers(campaign)):
+    for i, header in enumerate(make_score_headers(campaign)):
         side: Literal["left", "right"] = "right" if i >= first_number else "left"
         table.add_column(Text(fill(visible(header), 7)), overflow="fold", justify=side)
     for score in scores[:ROWS]:
-        table.add_row(*(Text(visible(cell)) for cell in score_row(campaign, score)))
+        table.add_row(*(Text(visible(cell)) for cell in make_score_cells(campaign, score)))
     console = rich.console.Console()
     console.print(table)
     if len(scores) > ROWS:

@@ -84,7 +84,7 @@ def unite_labels(parts: Mapping[int, AxisLabels]) -> AxisLabels:
     )
 
 
-def check_within(labels: AxisLabels, known: AxisLabels, setting: int) -> None:
+def check_labels_within(labels: AxisLabels, known: AxisLabels, setting: int) -> None:
     """Raise ValueError if a setting has a name, or a longer measurement, that the store has not.
 
     `labels`: those of the setting; `known`: those of the store.
@@ -262,21 +262,21 @@ def find_done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in variables(campaign)))
 
 
-def find_described(path: Path) -> set[tuple[int, ...]]:
+def find_described_settings(path: Path) -> set[tuple[int, ...]]:
     """Return {(setting,)} of the settings whose claims are written in the store."""
     return set(_find_chunk_files(path / CLAIM, 1))
 
 
-def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
+def remove_damaged_chunks(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
     files = [file for name in variables(campaign) for file in _find_chunk_files(path / name, 2).values()]
-    damaged = [file for file in (*files, *_find_chunk_files(path / CLAIM, 1).values()) if not _is_whole(file)]
+    damaged = [file for file in (*files, *_find_chunk_files(path / CLAIM, 1).values()) if not _has_right_checksum(file)]
     for file in damaged:
         file.unlink()
     return damaged
 
 
-def _is_whole(file: Path) -> bool:
+def _has_right_checksum(file: Path) -> bool:
     """Return whether the last four bytes are the checksum of all others."""
     data = file.read_bytes()
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
@@ -295,7 +295,7 @@ def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]
     return found
 
 
-def remove_partial(path: Path) -> None:
+def remove_partial_files(path: Path) -> None:
     """Remove the partial files of a process that was killed."""
     for folder in path.iterdir():
         for file in folder.iterdir() if folder.is_dir() else ():

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app_and_option_types import choose_results_folder, measured_option, number, path_option
-from heliograph.cli.measured_data import ReadingOptions, read_measured
+from heliograph.cli.measured_data import ReadingOptions, read_measured_plants
 from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.report.progress import Advance
-    from heliograph.report.results_folder import Results
+    from heliograph.report.results_folder import ResultsContent
     from heliograph.simulation.network import Network
 
 NAME = "backtest"
@@ -63,7 +63,9 @@ def backtest(
 
         advance("reading")
         loaded, module = load_module(network)
-        (data, *others) = read_measured(measurements, network, loaded, module, reading or ReadingOptions(), advance)
+        (data, *others) = read_measured_plants(
+            measurements, network, loaded, module, reading or ReadingOptions(), advance
+        )
         if others:
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
@@ -74,7 +76,7 @@ def backtest(
             loaded, z, rows_ahead, inputs=u, time=time, truth=truth, skip=skip, refit=fit_to_first, every=refit or 1
         )
 
-    def make_results(found: "heliograph.forecasting.Backtest") -> "Results":
+    def make_results(found: "heliograph.forecasting.Backtest") -> "ResultsContent":
         """Return the content of the results folder."""
         from heliograph.report.pages.backtest import make_backtest_results
 

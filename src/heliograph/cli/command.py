@@ -20,7 +20,7 @@ from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
-from heliograph.cli.stop_signals import INTERRUPTED, SIGNALLED, stoppable
+from heliograph.cli.stop_signals import INTERRUPTED, SIGNALLED, unwind_on_signals
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.process.extras import EXTRAS, MissingPackagesError, how_to_install
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
     stopped: list[int] = []
     try:
-        with stoppable(stopped):
+        with unwind_on_signals(stopped):
             code = _run_command(arguments)
     except KeyboardInterrupt:
         return SIGNALLED + stopped[0] if stopped else INTERRUPTED

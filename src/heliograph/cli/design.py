@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
     from heliograph.report.pages.design import DesignResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results_folder import Results
+    from heliograph.report.results_folder import ResultsContent
 
 NAME = "design"
 
@@ -35,11 +35,11 @@ def design(
     target = choose_results_folder("design", out, NAME) / NAME
     file = read_design(task)
 
-    def results_of(designed: "DesignResults") -> "Results":
+    def results_of(designed: "DesignResults") -> "ResultsContent":
         """Return the content of the results folder."""
-        from heliograph.report.pages.design import design_results
+        from heliograph.report.pages.design import make_design_results
 
-        return design_results(designed)
+        return make_design_results(designed)
 
     designed = write_results(target, count_stages(file), lambda advance: compute_design(file, advance), results_of)
     best = designed.design

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from heliograph.cli.app_and_option_types import path_option
 
 if TYPE_CHECKING:
-    from heliograph.export.c_files import Cost, Exported
+    from heliograph.export.c_files import Exported, StepCost
 
 
 def export(
@@ -64,7 +64,7 @@ KINDS = {
 }
 
 
-def describe_costs(written: "Exported", measured: "Cost") -> list[str]:
+def describe_costs(written: "Exported", measured: "StepCost") -> list[str]:
     """Return two lines on the cost of a step: its operations by kind; bytes of state and code, and its time."""
     from heliograph.export.c_files import COMPILER
 

@@ -65,7 +65,7 @@ def filter_plant(
     # Times of dated messages count from a date, in seconds.
     if data.events is not None and data.events.dated and record.origin is not None:
         record = record.with_units({"time": "s"} | record.units)
-    said = [*_describe_doubted(network, record), *data.summary]
+    said = [*_describe_doubted_values(network, record), *data.summary]
     forecasts: ByFilter = {}
     if horizons is not None:
         forecasts = _make_forecasts(record, horizons)
@@ -90,13 +90,13 @@ def write_plant_estimates(
     options: ReadingOptions,
 ) -> list[str]:
     """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
-    write = _choose_writer(plant.data, module)
-    predicted = _select_rows_of_predicted(plant.predicted, plant.data.rows)
+    write = _make_estimates_writer(plant.data, module)
+    predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
     _write_estimates(write, plant.written, plant.forecasts, predicted, place, plant.data)
     return _write_lagged_estimates(network, plant.data, lag, options, place, write)
 
 
-def place_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
+def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
     """Return where a plant's estimates go: of several, each has a file of its name."""
     if isinstance(out, StoreAddress):
         return out
@@ -119,7 +119,7 @@ def filter_rows(
     return record, [str(doubt.message) for doubt in doubts]
 
 
-def _describe_doubted(network: "Network", record: "Record") -> list[str]:
+def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
     """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
     from heliograph.report.sensor_output_health import summarise_weighed_outputs
 
@@ -178,7 +178,7 @@ def _describe_forecasts(forecasts: "ByFilter") -> str:
     return f"forecast: {len(any_forecast.steps)} rows behind the data, to {any_forecast.time[-1]}{held}"
 
 
-def _select_rows_of_predicted(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
+def _select_times_of_predictions(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
     """Return what was predicted of some of the rows; `rows`: a mask, None for all."""
     if rows is None or rows.all():
         return predicted
@@ -201,15 +201,15 @@ def _write_estimates(
         write(record, place)
         return
     from heliograph.files.estimates.estimates_table import estimate_columns
-    from heliograph.files.estimates.forecasts_table import forecast_columns
-    from heliograph.files.stores.store_tables import write_columns
+    from heliograph.files.estimates.forecasts_table import make_forecast_columns
+    from heliograph.files.stores.store_tables import write_columns_to_store
     from heliograph.files.table import write_table
 
-    columns = forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
+    columns = make_forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
     if isinstance(place, Path):
         write_table(columns, place)
     else:
-        write_columns(place, columns, data.plant, _find_origin(data))
+        write_columns_to_store(place, columns, data.plant, _find_date_of_time_zero(data))
 
 
 def _write_lagged_estimates(
@@ -239,23 +239,23 @@ def _write_lagged_estimates(
     if isinstance(place, Path):
         beside = place.with_suffix(f".lagged{place.suffix}")
     else:
-        beside = place.named(f"{place.written_table}_lagged")
+        beside = place.with_table(f"{place.table_for_estimates}_lagged")
     write(lagged, beside)
     return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
 
 
-def _choose_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
+def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
     """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
     from heliograph.files.bags.estimates_writer import write_bag
     from heliograph.files.estimates.estimates_table import estimate_columns, write_estimates
-    from heliograph.files.stores.store_tables import write_columns
+    from heliograph.files.stores.store_tables import write_columns_to_store
 
-    origin = _find_origin(data)
+    origin = _find_date_of_time_zero(data)
 
     def write(record: "Record", path: Path | StoreAddress) -> None:
         """Write the estimates of a record, in the form that the path asks for."""
         if isinstance(path, StoreAddress):
-            write_columns(path, estimate_columns(record), data.plant, origin)
+            write_columns_to_store(path, estimate_columns(record), data.plant, origin)
         elif path.suffix.lower() == ".mcap":
             write_bag(record, path, origin, module.get("pose"))  # type: ignore[arg-type]  # it says what it expects
         else:
@@ -264,7 +264,7 @@ def _choose_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Wr
     return write
 
 
-def _find_origin(data: "MeasuredPlant") -> "np.datetime64 | None":
+def _find_date_of_time_zero(data: "MeasuredPlant") -> "np.datetime64 | None":
     """Return the date of time 0, of messages whose times are dates."""
     messages = data.events
     return None if messages is None or messages.steps or messages.numbers else messages.date

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app_and_option_types import measured_option, number, path_option
-from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants, take_only_plant
 from heliograph.cli.stop_signals import GentleStop
 from heliograph.files.stores.store_address import StoreAddress
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from heliograph.learning.losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results_folder import Json, Results
+    from heliograph.report.results_folder import Json, ResultsContent
     from heliograph.simulation.network import Network
 
 STAGES = 6  # of the work, for the progress bar
@@ -65,7 +65,9 @@ def fit(
 
         def work(advance: "Advance") -> "FitResults":
             """Learn with the options of the command."""
-            return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
+            return fit_and_judge(
+                network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop
+            )
 
         learned = write_results(out, STAGES, work, lambda learning: collect_results_files(learning, out, network))
         print(learned.fit)
@@ -76,7 +78,7 @@ def fit(
     return stop.code
 
 
-def learn(
+def fit_and_judge(
     network: str,
     measurements: Path | StoreAddress,
     starts: int,
@@ -115,7 +117,7 @@ def learn(
     if has_deciding_sender(start):
         call = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
         raise fail("network to be learned", f"no trigger of a node (in Python {call} learns it)", "one with a trigger")
-    data = _read_data(measurements, network, start, advance, truth, reading)
+    data = _read_rows_to_fit(measurements, network, start, advance, truth, reading)
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
@@ -128,15 +130,15 @@ def learn(
     changes: list[Change] = []
     uniform: list[Uniformity] = []
     if learned_rows < rows:
-        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
+        changes = stop.run_unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
     if changes:
-        uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
+        uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
     advance("looking at losses")
-    losses = stop.unless_stopped(lambda: _learn_lossy(start, recording)) or {}
+    losses = stop.run_unless_stopped(lambda: _estimate_losses_by_node(start, recording)) or {}
     return FitResults(network, str(measurements), fitted, learned_rows, rows - learned_rows, changes, uniform, losses)
 
 
-def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
+def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
     from heliograph.learning.losses.losses import learn_losses
 
@@ -166,7 +168,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     return fates
 
 
-def _read_data(
+def _read_rows_to_fit(
     measurements: Path | StoreAddress,
     reference: str,
     network: "Network",
@@ -180,7 +182,9 @@ def _read_data(
     from heliograph.numerics.check import fail
 
     module = load_module(reference)[1]
-    data = take_only_plant(measurements, read_measured(measurements, reference, network, module, reading, advance))
+    data = take_only_plant(
+        measurements, read_measured_plants(measurements, reference, network, module, reading, advance)
+    )
     for line in data.warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
     for line in data.summary:
@@ -215,7 +219,7 @@ def _fit_with_progress(
     def show_progress(line: str) -> None:
         """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
         stop.raise_if_requested()
-        stop.only_note_next()  # from here on there is a best so far, which the next signal keeps
+        stop.note_next_signal_only()  # from here on there is a best so far, which the next signal keeps
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)
@@ -225,11 +229,11 @@ def _fit_with_progress(
     return fitted
 
 
-def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
+def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
     """Return the content of the results folder."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
-    from heliograph.report.results_folder import Results
+    from heliograph.report.results_folder import ResultsContent
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
@@ -238,7 +242,7 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}
-    return Results(draw_fit_figures(learned), make_page_of_drawings(learned), summary, write)
+    return ResultsContent(draw_fit_figures(learned), make_page_of_drawings(learned), summary, write)
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":

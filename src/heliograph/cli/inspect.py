@@ -53,7 +53,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
     from heliograph.files.logs.vehicle_log import is_log
     from heliograph.files.messages.folder_of_message_files import is_folder
     from heliograph.files.messages.message_files import LINES
-    from heliograph.files.text.text_file import kind_of
+    from heliograph.files.text.text_file import find_extension
     from heliograph.files.topic_inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
     from heliograph.report.progress import progress
 
@@ -65,7 +65,7 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
             advance(f"listening for {seconds:g} s")
             return listen(parse_address(recording), seconds), ""
         path = Path(recording)
-        if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
+        if path.is_file() and find_extension(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
         if is_log(path):

@@ -75,7 +75,7 @@ class MeasuredPlant:
     warnings: list[str] = field(default_factory=list)
 
 
-def read_measured(
+def read_measured_plants(
     location: "Path | StoreAddress",
     reference: str,
     network: "Network",
@@ -98,7 +98,7 @@ def read_measured(
     """
     from heliograph.numerics.check import fail
 
-    path = open_measured(location)
+    path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
         if options.of_messages:
@@ -107,18 +107,18 @@ def read_measured(
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_make_rows_of_events(events.of(plant), plant, options) for plant in wanted]
     # What is said of the whole reading is said with one plant: warnings with the first, notes with the last.
-    measured[0].warnings.extend(describe_unread(path, events))
+    measured[0].warnings.extend(describe_unreadable_messages(path, events))
     measured[-1].summary.extend(events.notes)
     return measured
 
 
-def open_measured(location: "Path | StoreAddress") -> "Path | StoreTable":
+def open_path_or_store(location: "Path | StoreAddress") -> "Path | StoreTable":
     """Return the path itself, or the table that a store answers."""
     if isinstance(location, Path):
         return location
-    from heliograph.files.stores.store_tables import ask_store
+    from heliograph.files.stores.store_tables import query_store
 
-    return ask_store(location)
+    return query_store(location)
 
 
 def take_only_plant(path: object, measured: list[MeasuredPlant]) -> MeasuredPlant:
@@ -171,7 +171,7 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         recording, refused, notes = read_recording_rows(path, network, options.strict, options.ignore_unknown)
-    lines = [describe_refused(path, "rows", len(refused), refused[:REASONS])] if refused else []
+    lines = [describe_refusals(path, "rows", len(refused), refused[:REASONS])] if refused else []
     return MeasuredPlant("", recording, warnings=[*lines, *notes, *(str(doubt.message) for doubt in doubts)])
 
 
@@ -195,18 +195,18 @@ def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptio
     return MeasuredPlant(plant, recording, rows, events, summary=lines)
 
 
-def describe_unread(path: object, events: "EventTable") -> list[str]:
+def describe_unreadable_messages(path: object, events: "EventTable") -> list[str]:
     """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
     from heliograph.model.checks.refusals import describe_counts
 
     lines = [events.broken] if events.broken else []
     if events.refused:
         by_node = [f"{node}: {describe_counts(counts)}" for node, counts in events.refusals.items()]
-        lines.append(describe_refused(path, "messages", events.refused, events.reasons, "; ".join(by_node)))
+        lines.append(describe_refusals(path, "messages", events.refused, events.reasons, "; ".join(by_node)))
     return lines
 
 
-def describe_refused(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
+def describe_refusals(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
     """Say how many rows or messages could not be read, how many for `known` reasons, and why, of the first of them."""
     more = count - len(reasons)
     others = f"; and {more} more" if more > 0 else ""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app_and_option_types import measured_option, number, path_option
-from heliograph.cli.measured_data import ReadingOptions, open_measured, read_events, read_rows
+from heliograph.cli.measured_data import ReadingOptions, open_path_or_store, read_events, read_rows
 from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def _read_events(
     from heliograph.serving.brokers.replay import events_of_recording
 
     network, module = load_module(reference)
-    path = open_measured(location)
+    path = open_path_or_store(location)
 
     def no_progress(what: str, done: int = 0, total: int = 0) -> None:
         """Show nothing: the standard output is a pipe."""
@@ -98,19 +98,19 @@ def _read_events(
     table = read_events(path, reference, network, module, options, no_progress)
     if table is None:  # rows of time
         rows = read_rows(path, network, options)
-        for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:
+        for line in [*rows.warnings, *_describe_too_fine_dates(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)
         yield ("", *events_of_recording(rows.recording, network))
         return
     import numpy as np
 
-    from heliograph.cli.measured_data import describe_unread
+    from heliograph.cli.measured_data import describe_unreadable_messages
 
     lines_on_digits: list[str] = []
     if table.dated:
         times = [columns.time for name in table.plants for columns in table.of(name).columns.values()]
-        lines_on_digits = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]"))
-    for line in [*describe_unread(path, table), *table.notes, *lines_on_digits]:
+        lines_on_digits = _describe_too_fine_dates(path, np.concatenate(times).astype("datetime64[ns]"))
+    for line in [*describe_unreadable_messages(path, table), *table.notes, *lines_on_digits]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)
@@ -118,7 +118,7 @@ def _read_events(
         yield name, list(events.sort_events()), events.date if has_dates else None
 
 
-def _describe_finer(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
+def _describe_too_fine_dates(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
     """Say how many dates are finer than the microseconds that messages have; nothing if none is."""
     if time.dtype.kind != "M":
         return []

@@ -9,9 +9,9 @@ from cyclopts import Parameter
 
 import heliograph
 from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
-from heliograph.cli.filter_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
-from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured
-from heliograph.cli.run_in_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
+from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
+from heliograph.cli.run_in_blocks import MessagesOfRun, WrittenRowCounts, run_in_blocks
 from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        said_of_blocks: SaidOfBlocks | None = None  # of a long table, which is not read as a whole but in blocks
+        said_of_blocks: MessagesOfRun | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
         measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)
@@ -89,7 +89,7 @@ def run(
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            place = out and place_of_plant(out, data.plant, several=len(measured) > 1)
+            place = out and choose_output_of_plant(out, data.plant, several=len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
                 plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
@@ -114,7 +114,7 @@ def _read_plants(
     """Return what was measured of each plant; raise ValueError if a lag is asked for of rows of time."""
     from heliograph.numerics.check import fail
 
-    measured = read_measured(measurements, reference, network, module, options, advance)
+    measured = read_measured_plants(measurements, reference, network, module, options, advance)
     if lag is not None and measured[0].events is None:
         raise fail("--lag", "messages or events", f"rows of time in {measurements}")
     return measured
@@ -177,18 +177,18 @@ def _check_options(
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Return a line on what was written where, and one on the errors of each filter."""
-    written = WrittenRows()
+    written = WrittenRowCounts()
     written.add(record)
     places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [written.describe(*places), *_describe_errors(record)]
+    return [written.describe(*places), *_describe_estimation_errors(record)]
 
 
-def _describe_errors(record: "Record") -> list[str]:
+def _describe_estimation_errors(record: "Record") -> list[str]:
     """Return a line on the errors of each filter if the truth is known: RMSE by state, and NEES (1: claim holds)."""
-    from heliograph.report.sensor_output_health import compare_with_truth, round_to
+    from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
-    for errors in compare_with_truth(record):
+    for errors in compute_filter_errors(record):
         parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()]
         nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
@@ -246,7 +246,7 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from dataclasses import replace
 
     from heliograph.report.recording_diagnosis import Health, examine
-    from heliograph.report.results_folder import Results, write_results
+    from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
         """Return the diagnosis of a plant, with its forecasts and residuals."""
@@ -262,7 +262,7 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         """Return the diagnosis of each plant, by name."""
         return {plant.data.plant: examine_plant(plant, advance) for plant in plants}
 
-    def results_of(health: dict[str, Health]) -> Results:
+    def results_of(health: dict[str, Health]) -> ResultsContent:
         """Return the content of the results folder: of one plant its page, of several an overview and folders."""
         from heliograph.report.pages.run import make_results_of_plants, make_run_results
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from heliograph.cli.filter_plant import filter_rows
-from heliograph.cli.measured_data import ReadingOptions, describe_refused
+from heliograph.cli.measured_data import ReadingOptions, describe_refusals
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.stores.store_address import StoreAddress
 
@@ -26,7 +26,7 @@ class AllRowsNeededError(Exception):
     """Why all rows of a recording are held in memory at once, in words."""
 
 
-class SaidOfBlocks(NamedTuple):
+class MessagesOfRun(NamedTuple):
     """Lines on a table that was filtered in blocks: warnings, and what was written."""
 
     warnings: list[str]
@@ -41,7 +41,7 @@ def run_in_blocks(
     others: Iterable[str],
     options: ReadingOptions,
     advance: "Advance",
-) -> SaidOfBlocks | None:
+) -> MessagesOfRun | None:
     """Filter a long table of rows of time, and write the estimates to a table.
 
     Args:
@@ -67,7 +67,7 @@ def run_in_blocks(
     if is_of_messages(measurements, module.get("sources")):
         return None
     try:
-        _check_for_needs(network, out, others)
+        _check_blocks_suffice(network, out, others)
         assert isinstance(out, Path)  # as was checked
         return filter_in_blocks(network, measurements, out, options, advance)
     except AllRowsNeededError as needed:
@@ -80,12 +80,12 @@ def run_in_blocks(
 
 def is_long(path: Path, limit: BlockSize = LONG) -> bool:
     """Return whether a table is beyond a limit: of bytes of CSV, of rows of Parquet."""
-    from heliograph.files.text.text_file import kind_of
+    from heliograph.files.text.text_file import find_extension
 
     if not path.is_file():
         return False
-    if kind_of(path) != ".parquet":
-        return kind_of(path) == ".csv" and path.stat().st_size > limit.bytes
+    if find_extension(path) != ".parquet":
+        return find_extension(path) == ".csv" and path.stat().st_size > limit.bytes
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -95,7 +95,7 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
         return False
 
 
-def _check_for_needs(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
+def _check_blocks_suffice(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
     """Raise AllRowsNeededError where options, the output or the network need all rows at once.
 
     `others`: the options that are given and need them.
@@ -121,7 +121,7 @@ def filter_in_blocks(
     advance: "Advance",
     block: BlockSize = USUAL_BLOCK,
     most: int = MOST,
-) -> SaidOfBlocks:
+) -> MessagesOfRun:
     """Filter the rows of a table and write the estimates, block by block; return what is to be said of it.
 
     Args:
@@ -147,7 +147,7 @@ def filter_in_blocks(
         advance(f"filtering {path}", done, total)
 
     blocks = RecordingBlocks(path, network, options.strict, options.ignore_unknown, block, progress)
-    written, doubts = WrittenRows(), BlockLines()
+    written, doubts = WrittenRowCounts(), MergedBlockWarnings()
     record: Record | None = None  # of the block before, from whose end the filters go on
     try:
         with open_table(out) as append:
@@ -168,13 +168,15 @@ def filter_in_blocks(
             limit = f"more than {most:,} rows are read in blocks of {block.rows:,}, and may be out of order within one"
             raise InputError(f"{error}: {limit}: sort the file by time, or correct the row") from None
         raise AllRowsNeededError(str(error)) from None
-    refused = [describe_refused(path, "rows", blocks.refused, list(map(str, blocks.reasons)))] if blocks.refused else []
-    return SaidOfBlocks(
+    refused = (
+        [describe_refusals(path, "rows", blocks.refused, list(map(str, blocks.reasons)))] if blocks.refused else []
+    )
+    return MessagesOfRun(
         warnings=[*refused, *blocks.notes, *blocks.doubts, *doubts.list_lines()], summary=[written.describe(out)]
     )
 
 
-class WrittenRows:
+class WrittenRowCounts:
     """Counts of the rows whose estimates were written, and of those in which a filter claims nothing.
 
     Attributes:
@@ -207,7 +209,7 @@ class WrittenRows:
         return f"{' and '.join(map(str, places))}: {self.rows} rows of {', '.join(filters)}"
 
 
-class BlockLines:
+class MergedBlockWarnings:
     """Lines on blocks of rows: those that differ in their numbers alone are one, of the first block that has it."""
 
     def __init__(self) -> None:

@@ -67,7 +67,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
     # "each" is all nodes, one after another, unless a node has that name.
     is_each = EACH in options.without and EACH not in network.nodes
     if options.figure is not None:
-        _check_figure(options.figure)
+        _check_figure_writable(options.figure)
     worth: SensorWorth = hg.planning.worth_of_sensors(
         network,
         options.steps,
@@ -80,7 +80,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
     return worth
 
 
-def _check_figure(figure: Path) -> None:
+def _check_figure_writable(figure: Path) -> None:
     """Raise the error that writing the figure would raise."""
     from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.extras import check_installed

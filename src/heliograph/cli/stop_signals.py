@@ -19,7 +19,7 @@ SOON = 0.01  # seconds
 
 
 @contextmanager
-def stoppable(stopped: list[int]) -> Iterator[None]:
+def unwind_on_signals(stopped: list[int]) -> Iterator[None]:
     """Let SIGINT and SIGTERM unwind the running code, so that no temporary file is left; record each in `stopped`.
 
     An exception that is raised in a callback of the compiler, or in a destructor, does not get out of it: Python only
@@ -53,15 +53,15 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
 
 
 class GentleStop:
-    """A stop that keeps what there is: after `only_note_next` a first signal is only noted, and a second one unwinds.
+    """A stop that keeps what there is: after `note_next_signal_only` the first signal is noted, the second unwinds.
 
-    The exit code is that of the first: a second may be the interrupt that `stoppable` raises again where the first was
-    swallowed. As a context it gives the signals back at its end.
+    The exit code is that of the first: a second may be the interrupt that `unwind_on_signals` raises again where the
+    first was swallowed. As a context it gives the signals back at its end.
     """
 
     def __init__(self) -> None:
         self._number = 0  # of the first signal; 0 for none
-        self._handlers: dict[int, object] = {}  # of each signal before `only_note_next`, to be put back
+        self._handlers: dict[int, object] = {}  # of each signal before `note_next_signal_only`, to be put back
 
     def __enter__(self) -> "GentleStop":
         return self
@@ -79,7 +79,7 @@ class GentleStop:
         """Return the command's exit code: 0, or the one that says which signal stopped it."""
         return SIGNALLED + self._number if self._number else 0
 
-    def only_note_next(self) -> None:
+    def note_next_signal_only(self) -> None:
         """Only note the next signal."""
         if not self._handlers and not self._number:
             self._handlers = {number: signal.getsignal(number) for number in STOPPING}
@@ -92,12 +92,12 @@ class GentleStop:
         if self._number:
             raise KeyboardInterrupt
 
-    def unless_stopped(self, work: Callable[[], T]) -> T | None:
+    def run_unless_stopped(self, work: Callable[[], T]) -> T | None:
         """Return the value of work that may be left out, None if a signal came before its end."""
         if self._number:
             return None
         try:
-            with handle_stop_signals(self._interrupt):
+            with handle_stop_signals(self._raise_on_signal):
                 return work()
         except KeyboardInterrupt:
             if not self._number:
@@ -105,7 +105,7 @@ class GentleStop:
         self._restore_handlers()
         return None
 
-    def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
+    def _raise_on_signal(self, number: int, _: FrameType | None) -> NoReturn:
         """Note a signal, and end what is running."""
         self._number = self._number or number
         raise KeyboardInterrupt
@@ -116,7 +116,7 @@ class GentleStop:
         self._restore_handlers()
 
     def _restore_handlers(self) -> None:
-        """Give signals the handlers back that they had before `only_note_next`."""
+        """Give signals the handlers back that they had before `note_next_signal_only`."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._handlers = {}

@@ -66,7 +66,7 @@ def example(
 ) -> None:
     """Run an example and report, or list them."""
     if name is None:
-        return print_list("example")
+        return print_studies("example")
     run_studies([name], out, collect_changes(changes, seed=seed, trace=trace, recording=recording), "example")
 
 
@@ -81,7 +81,7 @@ def reproduce(
 ) -> None:
     """Run a published method as printed and as improved, and judge each of its statements by this very run."""
     if method is None:
-        return print_list("publication")
+        return print_studies("publication")
     from heliograph.numerics.check import fail
 
     if method == "all" and changes:
@@ -204,7 +204,7 @@ def load(entry: EntryPoint) -> Study:
     return study
 
 
-def print_list(kind: str) -> None:
+def print_studies(kind: str) -> None:
     """Print the studies of a kind, with the first line of each docstring."""
     known = list_studies(kind)
     width = max(map(len, known), default=0)

@@ -38,9 +38,9 @@ def explore(
     out: Annotated[Path, path_option("Folder for explore.html.")],
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
-    from heliograph.campaign.explore_page import write_explorer
+    from heliograph.campaign.explore_page import write_explore_page_file
     from heliograph.disk.atomic_files import check_folder_writable
 
     check_folder_writable(out)
-    page = write_explorer(results, out)
+    page = write_explore_page_file(results, out)
     rich.console.Console().print(f"Page: {page}", soft_wrap=True, highlight=False, markup=False)

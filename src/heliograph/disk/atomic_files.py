@@ -139,7 +139,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
-        _clear_partial(path)
+        _remove_leftover_files(path)
     replaced: list[tuple[Path, bytes | None]] = []  # with the earlier contents, None of a file that is new
     try:
         with name_path_in_errors(paths[0]):
@@ -165,7 +165,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         raise
 
 
-def _clear_partial(path: Path) -> None:
+def _remove_leftover_files(path: Path) -> None:
     """Remove the temporary files next to `path` of processes that no longer run."""
     for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
         if not _is_running(left.name.split(".")[-2]):
@@ -259,14 +259,14 @@ def whole_folder(target: Path) -> Iterator[Path]:
         with hold_signals():
             lock.close()
             if temporary is not None:
-                _restore_old(temporary, target)
+                _restore_old_folder(temporary, target)
             for folder in made:
                 with suppress(OSError):  # somebody else's files came into it meanwhile
                     folder.rmdir()
         raise
 
 
-def _restore_old(temporary: Path, target: Path) -> None:
+def _restore_old_folder(temporary: Path, target: Path) -> None:
     """Put earlier results that were moved aside back in place of `target`, and remove the temporary folder."""
     if (temporary / "old").exists() and not target.exists():
         (temporary / "old").rename(target)

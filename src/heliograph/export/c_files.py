@@ -115,7 +115,7 @@ def write_filter(
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
     late = None if window is None else check_window(filter, window)
-    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
+    text = make_c_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -140,7 +140,7 @@ def check_source_path(path: str | Path) -> Path:
     return source
 
 
-def make_text(
+def make_c_text(
     filter: AbstractFilter,
     received: Sequence[str],
     prefix: str,
@@ -188,18 +188,18 @@ def carries_factors(filter: AbstractFilter) -> bool:
     return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
 
 
-class Cost(NamedTuple):
+class StepCost(NamedTuple):
     """Bytes of code and constants, and nanoseconds of a step, the fastest of five rounds; None if not measured."""
 
     code_bytes: int | None
     nanoseconds: float | None
 
 
-def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
+def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
     """Return the bytes of code and the time of a step, compiled in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
-        return Cost(None, None)
+        return StepCost(None, None)
     with tempfile.TemporaryDirectory() as temporary:
         folder, name = Path(temporary), source.stem
         for path in (header, source):
@@ -208,10 +208,12 @@ def measure_cost(header: Path, source: Path, received: int, inputs: int, real: R
         _run_command(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
         timer = ["-D_POSIX_C_SOURCE=199309L", *FLAGS, "main.c", "step.o", "-lm", "-o", "timer"]
         _run_command(compiler, *timer, folder=folder)
-        return Cost(_measure_code(folder), nanoseconds=float(_run_command(str(folder / "timer"), folder=folder)))
+        return StepCost(
+            _measure_code_size(folder), nanoseconds=float(_run_command(str(folder / "timer"), folder=folder))
+        )
 
 
-def _measure_code(folder: Path) -> int | None:
+def _measure_code_size(folder: Path) -> int | None:
     """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None

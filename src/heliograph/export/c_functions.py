@@ -59,14 +59,14 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
         body = [
-            *_check_measurement(program),
-            *_check_inputs(program),
+            *_write_measurement_check(program),
+            *_write_inputs_check(program),
             *_write_part_statements(program, 0, prefix),
             "    return 0;",
         ]
         return [_join_function(heads[0], body)]
-    predict = [*_check_inputs(program), *_write_part_statements(program, 0, prefix), "    return 0;"]
-    correct = [*_check_measurement(program), *_write_part_statements(program, 1, prefix), "    return 0;"]
+    predict = [*_write_inputs_check(program), *_write_part_statements(program, 0, prefix), "    return 0;"]
+    correct = [*_write_measurement_check(program), *_write_part_statements(program, 1, prefix), "    return 0;"]
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",
@@ -85,12 +85,12 @@ def _join_function(head: str, body: list[str]) -> str:
     return "\n".join([head, "{", *body, "}"])
 
 
-def _check_measurement(program: StepProgram) -> list[str]:
+def _write_measurement_check(program: StepProgram) -> list[str]:
     """Return the statements that refuse infinite components of a measurement."""
     return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
 
 
-def _check_inputs(program: StepProgram) -> list[str]:
+def _write_inputs_check(program: StepProgram) -> list[str]:
     """Return the statements that refuse inputs that are not finite, and a step past the end."""
     lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
     if program.filter.horizon is not None:
@@ -115,7 +115,7 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
     ]
     # The call: a number without axes is passed by value (as [0] of its member), all else as an array.
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
-    written = [*(f"after.{m.name}" for m in program.members), *(_place_beside(name) for name in part.beside)]
+    written = [*(f"after.{m.name}" for m in program.members), *(_name_place_of_result(name) for name in part.beside)]
     arguments = [*read, *part.data, _write_step_number(program, part), *written]
     call = f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");"
     checks = [
@@ -137,7 +137,7 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
     ]
 
 
-def _place_beside(name: str) -> str:
+def _name_place_of_result(name: str) -> str:
     """Return the C expression for where a result beside the state is written: flags are local, others in `news`.
 
     That is the innovation that the function tells; of it single numbers are passed by their address.

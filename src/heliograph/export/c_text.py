@@ -74,8 +74,8 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     source = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
-        functions="\n\n".join(_write_static(code) for code in (*starts, *program.computes)),
-        start=_write_start(program),
+        functions="\n\n".join(_write_static_function(code) for code in (*starts, *program.computes)),
+        start=_write_initial_state(program),
         step="\n\n".join([*write_functions(program, prefix, real), *([] if window is None else window.functions)]),
         mean=program.mean,
         covariance=program.covariance,
@@ -101,7 +101,7 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     )
 
 
-def _write_static(code: Any) -> str:
+def _write_static_function(code: Any) -> str:
     """Return the text of a function that only this file knows."""
     text: str = code.definition
     return text.replace(f"void {code.name}(", f"static void {code.name}(", 1)
@@ -112,7 +112,7 @@ def _declare_counter(program: StepProgram) -> list[str]:
     return ["    int64_t step;"] if program.counts else []
 
 
-def _write_start(program: StepProgram) -> str:
+def _write_initial_state(program: StepProgram) -> str:
     """Return the statements that set the state before the first step."""
     members = ", ".join(f"state->{m.name}" for m in program.members)
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.export.step_program import Real, StepProgram
-from heliograph.export.struct_layout import Layout, lay_out_array, lay_out_struct
+from heliograph.export.struct_layout import StructLayout, lay_out_array, lay_out_struct
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.checks.divided_time import explain_unevenness, find_part_by_steps
 from heliograph.model.over_time import first
@@ -22,7 +22,7 @@ from heliograph.numerics.check import check_count, fail
 DIGITS = {"double": float(np.finfo(np.float64).eps), "float": float(np.finfo(np.float32).eps)}
 
 
-class Window(NamedTuple):
+class LateMeasurementWindow(NamedTuple):
     """Rows that are held for late measurements.
 
     Args:
@@ -81,7 +81,7 @@ class WindowText(NamedTuple):
     size: int
 
 
-def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, real: Real) -> WindowText:
+def write_window(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
     """Return the text of the window of a filter whose plant counts steps, or has a time step among its inputs.
 
     Args:
@@ -94,13 +94,13 @@ def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, r
     filter = program.filter
     inputs, received = filter.inputs, filter.received
     place_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
-    window = Window(steps=steps, time=place_of_time, received=received, inputs=len(inputs))
+    window = LateMeasurementWindow(steps=steps, time=place_of_time, received=received, inputs=len(inputs))
     # The struct: the present state, rows of a state with the measurement and the inputs after it, and the four counters
     # of `_declare_window`. C has no arrays of length 0.
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
     row = lay_out_struct([state, *data])
     counters = [lay_out_array("uint32_t", 1)] * 4
-    whole = lay_out_struct([state, Layout(window.places * row.size, row.alignment), *counters])
+    whole = lay_out_struct([state, StructLayout(window.places * row.size, row.alignment), *counters])
     return WindowText(
         comment=_explain_window(window, prefix, whole.size),
         types=_declare_window(window, prefix, real),
@@ -110,7 +110,7 @@ def write_window(program: StepProgram, steps: int, state: Layout, prefix: str, r
     )
 
 
-def _list_heads(window: Window, prefix: str, real: Real) -> list[str]:
+def _list_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
     """Return the heads of the window's functions."""
     held, ago = f"{prefix}_window *window", "uint32_t steps" if window.time is None else f"{real} age"
     return [
@@ -120,7 +120,7 @@ def _list_heads(window: Window, prefix: str, real: Real) -> list[str]:
     ]
 
 
-def _declare_window(window: Window, prefix: str, real: Real) -> str:
+def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> str:
     """Return the declarations of a row and of the window."""
     received, inputs = max(window.received, 1), max(window.inputs, 1)
     return f"""typedef struct {{
@@ -141,7 +141,7 @@ typedef struct {{
 """
 
 
-def _explain_window(window: Window, prefix: str, bytes_held: int) -> list[str]:
+def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int) -> list[str]:
     """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
 
     A row is a step that the window holds. A late measurement has all rows from its own on run again, at most all
@@ -181,7 +181,7 @@ def _explain_window(window: Window, prefix: str, bytes_held: int) -> list[str]:
     ]
 
 
-def _write_functions(window: Window, prefix: str, real: Real) -> list[str]:
+def _write_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
     """Return the text of the window's functions, and of those that they share."""
     received, inputs = window.received, window.inputs
     missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"
@@ -192,8 +192,8 @@ def _write_functions(window: Window, prefix: str, real: Real) -> list[str]:
         "places": f"{window.places}U",
         "rows": f"{window.rows}U",
         "check": "\n".join([*(f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(received)), nothing]),
-        "copy_z": _write_copy("row->z", "z", received),
-        "copy_u": _write_copy("row->u", "u", inputs),
+        "copy_z": _write_array_copy("row->z", "z", received),
+        "copy_u": _write_array_copy("row->u", "u", inputs),
         "received": received,
         "head": _list_heads(window, prefix, real)[2],
     }
@@ -203,7 +203,7 @@ def _write_functions(window: Window, prefix: str, real: Real) -> list[str]:
     return [text.format(**names) for text in (_PLACE, _RUN, _FILL, _START, _STEP, late)]
 
 
-def _write_copy(target: str, source: str, count: int) -> str:
+def _write_array_copy(target: str, source: str, count: int) -> str:
     """Return the statements that copy an array; none of an empty one."""
     if not count:
         return f"    (void){source};"

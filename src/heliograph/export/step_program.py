@@ -91,12 +91,12 @@ def write_step_program(
         # Mean and covariance of the estimate become members of their own only where no array of the state has the same
         # numbers after every part. So all are written once to see which results are the same; `holders` are the
         # numbers of the two candidates that hold mean and covariance, the highest where parts differ.
-        with_all = [_write_part(part, symmetric, prefix, real, size) for part in parts]
+        with_all = [_lower_part_to_c(part, symmetric, prefix, real, size) for part in parts]
         numbers = range(len(read), len(candidates))
         holders = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
         kept = [*range(len(read)), *(n for n in holders if n >= len(read))]
         members = [candidates[n] for n in kept]
-        computes = [_write_part(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
+        computes = [_lower_part_to_c(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
         names, starts = [m.name for m in members], [m.start for m in members]
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
         # A state that is nothing but a mean and a covariance can be set to others.
@@ -139,7 +139,7 @@ def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> i
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
 
 
-def _write_part(
+def _lower_part_to_c(
     part: PartOfStep,
     symmetric: set[int],
     prefix: str,
@@ -236,7 +236,7 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     leaves = parts[0].examples[0]
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
     while symmetric:
-        codes = [_write_part(part, symmetric, "step", "double") for part in parts]
+        codes = [_lower_part_to_c(part, symmetric, "step", "double") for part in parts]
         lost = {n for n in symmetric if not all(code.results[n].symmetric for code in codes)}
         if not lost:
             break

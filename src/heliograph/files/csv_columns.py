@@ -52,9 +52,9 @@ def _read_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> Ro
     rest = lines[begin:] if begin else lines
     if not rows and text.header and not text.is_open:
         numbers = parse_plain_lines(rest, len(text.header))
-        if numbers is not None and columns.accepts_plain(text.header, numbers):
+        if numbers is not None and columns.accepts_numbers(text.header, numbers):
             text.number += len(numbers)
-            return columns.take_plain(text.header, numbers, text.number - len(numbers) + 1)
+            return columns.make_rows_of_numbers(text.header, numbers, text.number - len(numbers) + 1)
     return columns.read([*rows, *(row for line in split_lines(rest) for row in text.add(line))])
 
 
@@ -102,14 +102,14 @@ class CsvColumnReader:
                 columns[name] = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
         return Rows(columns, np.array(numbers, dtype=np.int64), refused)
 
-    def accepts_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
+    def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
         """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles."""
         if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
             return False
         dated = [i for i, name in enumerate(header) if self._dated.get(name)]
         return bool(np.isnan(numbers[:, dated]).all())
 
-    def take_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int) -> Rows:
+    def make_rows_of_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int) -> Rows:
         """Return numbers under this header as rows, the number of whose first one is `first`."""
         self.header, columns = header, dict[str, np.ndarray]()
         for name, values in zip(header, numbers.T, strict=True):

@@ -95,7 +95,7 @@ class DeviceStatuses:
         return list(self._by_pattern)
 
     @property
-    def unheard(self) -> list[str]:
+    def unheard_topics(self) -> list[str]:
         """Return the topics, wildcards included, on which no device has said a word."""
         return [topic for topic, several in self._by_pattern.items() if not self._heard.intersection(several)]
 
@@ -104,7 +104,7 @@ class DeviceStatuses:
         matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
 
-    def take_last_word(self, topic: str, payload: object, where: str) -> bool:
+    def take_status_message(self, topic: str, payload: object, where: str) -> bool:
         """Note the last word of a device if a message is one; return whether it is.
 
         Args:
@@ -118,20 +118,20 @@ class DeviceStatuses:
         conditions = self.find_conditions(topic)
         if not conditions:
             return False
-        said, before = _decode_payload(payload, where), self._number_words(topic)
+        said, before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
         for condition in conditions:
             self._note_word(condition, topic, offline=said != "" and condition.says_offline(said, where))
-        if self._number_words(topic) != before:
+        if self._encode_words_as_bits(topic) != before:
             self._changed.add(topic)
         return True
 
-    def take_changed_words(self) -> dict[str, int]:
+    def pop_changed_words(self) -> dict[str, int]:
         """Return {topic: its words as a number, as `restore` takes it} of the words changed since the last call."""
         changed, self._changed = self._changed, set()
-        return {topic: self._number_words(topic) for topic in changed}
+        return {topic: self._encode_words_as_bits(topic) for topic in changed}
 
     def restore(self, words: Mapping[str, int]) -> None:
-        """Take last words that were kept: of each topic its words as a number, as `take_changed_words` gives them."""
+        """Take last words that were kept: of each topic its words as a number, as `pop_changed_words` gives them."""
         for topic, bits in words.items():
             for i, condition in enumerate(self.find_conditions(topic)):
                 self._note_word(condition, topic, offline=bool((bits >> i) & 1))
@@ -144,7 +144,7 @@ class DeviceStatuses:
         else:
             self._offline.discard((condition, topic))
 
-    def _number_words(self, topic: str) -> int:
+    def _encode_words_as_bits(self, topic: str) -> int:
         """Return the words of a topic as a number: bit i is 1 if its i-th condition says offline."""
         conditions = self.find_conditions(topic)
         return sum(1 << i for i, condition in enumerate(conditions) if (condition, topic) in self._offline)

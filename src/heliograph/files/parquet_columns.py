@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.table_rows import Rows, convert_to_nanoseconds, numbers_of
+from heliograph.files.table_rows import Rows, convert_to_nanoseconds, convert_to_numbers
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import fail
@@ -73,7 +73,7 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
             columns[name] = convert_to_nanoseconds(days, f"{path}, column {name!r}", first)
             continue
         if pa.types.is_integer(kind) and not column.null_count:
-            columns[name] = numbers_of(column.to_numpy())
+            columns[name] = convert_to_numbers(column.to_numpy())
             continue
         is_number = pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)
         if not (is_number or pa.types.is_null(kind)):

@@ -6,14 +6,14 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from heliograph.files.recording_rows import RowsAsColumns
+from heliograph.files.recording_rows import RecordingRows
 from heliograph.files.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network
 
 
-class RowChecks:
+class RowRefusals:
     """Refuses rows of a table that cannot be read: the first is an error, or each is noted with the reason.
 
     Attributes:
@@ -47,7 +47,7 @@ class RowChecks:
         self.good &= ~bad
 
 
-def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowChecks) -> RowsAsColumns:
+def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowRefusals) -> RecordingRows:
     """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
     inputs, source = network.inputs, checks.source
     # By node the columns that each component of its measurements may have: of several names one.
@@ -74,14 +74,14 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowC
         measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
     # All inputs have to be there, but for a time step dt, which times say too.
     given = {
-        name: _read_complete(columns, _find_column(columns, (name,), source), checks)
+        name: _read_complete_column(columns, _find_column(columns, (name,), source), checks)
         for name in inputs
         if name != TIME_STEP or name in columns
     }
     truth = {
         state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
     }
-    return RowsAsColumns(checks.numbers, time, measurements, given, truth)
+    return RecordingRows(checks.numbers, time, measurements, given, truth)
 
 
 def list_truth_columns(network: Network) -> dict[str, str]:
@@ -127,23 +127,23 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
     return present[0]
 
 
-def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: RowRefusals) -> np.ndarray:
     """Return the times of the rows, dates where the column holds dates."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
-        return _read_complete(columns, name, checks)
+        return _read_complete_column(columns, name, checks)
     checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
     return values.astype("datetime64[ns]")
 
 
-def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_complete_column(columns: Mapping[str, np.ndarray], name: str, checks: RowRefusals) -> np.ndarray:
     """Return the numbers of a column in which every cell has to have one."""
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
     checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
-def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: RowRefusals) -> np.ndarray:
     """Return the numbers of a column, NaN where a cell is empty."""
     values = _read_numbers(columns, name, checks.source)
     checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))

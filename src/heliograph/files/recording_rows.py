@@ -15,7 +15,7 @@ from heliograph.simulation.network import Network
 MOST_OUT = 0.5  # share of the rows below which those that are out of order, or whose times were not set, are refused
 
 
-class RowsAsColumns(NamedTuple):
+class RecordingRows(NamedTuple):
     """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
 
     numbers: np.ndarray
@@ -24,22 +24,22 @@ class RowsAsColumns(NamedTuple):
     inputs: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
 
-    def of(self, good: np.ndarray | slice) -> "RowsAsColumns":
+    def of(self, good: np.ndarray | slice) -> "RecordingRows":
         """Return the rows of a mask, of numbers, or of a slice."""
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
-        return RowsAsColumns(self.numbers[good], self.time[good], *parts)
+        return RecordingRows(self.numbers[good], self.time[good], *parts)
 
 
-def join_cells(parts: Sequence[RowsAsColumns]) -> RowsAsColumns:
+def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
     """Return the rows of several parts of a table, one after the other."""
     named = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
-        for i in range(2, len(RowsAsColumns._fields))
+        for i in range(2, len(RecordingRows._fields))
     )
-    return RowsAsColumns(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+    return RecordingRows(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
 
 
-def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], int]:
+def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[RecordingRows, list[InputError], int]:
     """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
 
     Where time is continuous a time that is more than a year outside of all others was not set: its row is refused, and
@@ -75,7 +75,7 @@ def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[Row
     return kept.of(np.argsort(kept.time, kind="stable")), refused, behind
 
 
-class KeptRows(NamedTuple):
+class RowsWithMissing(NamedTuple):
     """Rows that a recording has, of which some may stand for rows that did not arrive.
 
     Attributes:
@@ -107,13 +107,13 @@ class KeptRows(NamedTuple):
         return filled
 
 
-def keep_rows(numbers: np.ndarray, network: Network, first: int = 1) -> KeptRows:
+def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -> RowsWithMissing:
     """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
 
     Steps begin with the row of number `first`.
     """
     if TIME_STEP in network.inputs or not len(numbers):
-        return KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
+        return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
     steps = np.arange(first, numbers[-1] + 1)
     before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
-    return KeptRows(steps, before, numbers[before] == steps)
+    return RowsWithMissing(steps, before, numbers[before] == steps)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.recording_rows import RowsAsColumns
+from heliograph.files.recording_rows import RecordingRows
 from heliograph.files.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
@@ -17,7 +17,7 @@ class RowsNotInBlocksError(InputError):
     """Rows of which only all together say in which order they are, or of which kind: one line that names the first."""
 
 
-class BlockOrder:
+class BlockOrderCheck:
     """Compares blocks, each in the order of its times by itself, with what `order_rows` makes of all rows together.
 
     Sorted blocks of which each begins where the one before it ended are all rows sorted. Where each row is a step the
@@ -36,13 +36,13 @@ class BlockOrder:
 
     def __init__(self, path: Path, network: Network):
         self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
-        self.last: RowsAsColumns | None = None
-        self._first: RowsAsColumns | None = None
-        self._disordered: RowsAsColumns | None = None  # two rows of which the second came after a later one
-        self._jump: RowsAsColumns | None = None  # two rows between which is more than a year
-        self._left_out = list[RowsAsColumns]()  # of each block those with the least and the greatest time
+        self.last: RecordingRows | None = None
+        self._first: RecordingRows | None = None
+        self._disordered: RecordingRows | None = None  # two rows of which the second came after a later one
+        self._jump: RecordingRows | None = None  # two rows between which is more than a year
+        self._left_out = list[RecordingRows]()  # of each block those with the least and the greatest time
 
-    def check_block(self, came: RowsAsColumns, ordered: RowsAsColumns) -> None:
+    def check_block(self, came: RecordingRows, ordered: RecordingRows) -> None:
         """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
 
         Args:
@@ -76,7 +76,7 @@ class BlockOrder:
         if len(left_out.numbers):
             self._left_out.append(left_out.of(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
-    def check_left_out(self) -> None:
+    def check_left_out_rows(self) -> None:
         """Check that all rows that blocks left out are more than a year outside of all that stay.
 
         Raises:
@@ -91,16 +91,16 @@ class BlockOrder:
                 if first - year <= rows.time[row] <= last + year:
                     raise self._make_refusal(_join_times(self.last, rows.of(slice(row, row + 1))), "times in order")
 
-    def _make_refusal(self, rows: RowsAsColumns, expected: str) -> RowsNotInBlocksError:
+    def _make_refusal(self, rows: RecordingRows, expected: str) -> RowsNotInBlocksError:
         """Return the error that names the second of two rows."""
         where = f"{self._path}, row {rows.numbers[1]}, column {TIME!r}"
         return RowsNotInBlocksError(str(fail(where, expected, backwards_text(rows.time, 1))))
 
 
-def _join_times(before: RowsAsColumns, after: RowsAsColumns) -> RowsAsColumns:
+def _join_times(before: RecordingRows, after: RecordingRows) -> RecordingRows:
     """Return the numbers and times of rows behind others."""
     numbers, time = (np.concatenate([before[i], after[i]]) for i in range(2))
-    return RowsAsColumns(numbers, time, {}, {}, {})
+    return RecordingRows(numbers, time, {}, {}, {})
 
 
 def _year_in_unit_of(time: np.ndarray) -> np.timedelta64 | float:

@@ -37,17 +37,17 @@ def _join_column(parts: list[np.ndarray]) -> np.ndarray:
     kinds = {part.dtype.kind for part in parts}
     if "M" in kinds:
         parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
-    elif kinds == {"i", "f"} and all(_is_whole(part) for part in parts):
+    elif kinds == {"i", "f"} and all(_are_whole_numbers(part) for part in parts):
         parts = [part.astype(np.int64) for part in parts]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _is_whole(numbers: np.ndarray) -> bool:
+def _are_whole_numbers(numbers: np.ndarray) -> bool:
     """Return whether all numbers are whole, and of a size at which doubles hold each."""
     return numbers.dtype.kind == "i" or bool(np.all((np.abs(numbers) < EXACT) & (numbers == np.trunc(numbers))))
 
 
-def numbers_of(column: np.ndarray) -> np.ndarray:
+def convert_to_numbers(column: np.ndarray) -> np.ndarray:
     """Return numbers as float64, or as int64 where that alone tells them apart."""
     whole = column.dtype.kind in "iu" and column.size and np.abs(column.astype(np.float64)).max() >= EXACT
     return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)

@@ -20,7 +20,7 @@ from heliograph.files.messages.folder_of_message_files import list_files
 from heliograph.files.messages.message_files import (
     decode_payload,
     is_message_file,
-    message_name,
+    make_default_topic,
     read_message_file,
 )
 from heliograph.files.sources.message_fields import TimeUnit, convert_time, decode_json, is_stamp, parse_arrival
@@ -87,7 +87,7 @@ class Topic:
     clocks: "dict[str, array[float]]" = field(default_factory=dict)
     own_clock: bool = False
 
-    def choose_time(self) -> None:
+    def choose_time_field(self) -> None:
         """Take for the time of the messages the first date that is not the same in all of them, or else the first.
 
         Without dates it is the first clock by name that never goes back; its messages were logged when it says.
@@ -95,18 +95,18 @@ class Topic:
         if self.time is not None:
             return
         if not self.dates:
-            self._choose_clock()
+            self._choose_clock_field()
             return
         varying = (path for path, (moments, _) in self.dates.items() if len(set(moments)) > 1)
         self.time = next(varying, next(iter(self.dates)))
         moments, self.late = self.dates[self.time]
         self.logged = self.logged or moments
 
-    def _choose_clock(self) -> None:
+    def _choose_clock_field(self) -> None:
         """Take for the time the first clock that has a number in every message and never goes back, if there is one."""
         for path, numbers in self.clocks.items() if not self.logged else ():
             if len(numbers) == self.messages > 1 and numbers[0] < numbers[-1] and np.all(np.diff(numbers) >= 0):
-                unit = _name_clock_unit(path)
+                unit = _read_unit_of_clock_name(path)
                 nanoseconds = np.rint(np.array(numbers) * UNITS[unit]).astype(np.int64)
                 self.time, self.own_clock, self.units[path] = path, True, unit
                 self.logged = array("q", nanoseconds.tobytes())
@@ -117,13 +117,13 @@ class Topic:
         """Return the path of the first field that is named as a running count is; None if none is."""
         return next((path for path in self.fields if COUNTS.fullmatch(path.split(".")[-1].lower())), None)
 
-    def list_measured(self) -> list[str]:
+    def list_fields_by_likelihood(self) -> list[str]:
         """Return the fields, those first that look like measurements."""
         return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_rank_field)
 
     def format_row(self) -> list[str]:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
-        self.choose_time()
+        self.choose_time_field()
         times = np.sort(np.array(self.logged, dtype=np.int64))
         apart = np.diff(times) / SECOND
         span = float(apart.sum())
@@ -142,12 +142,12 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
     """
     topics, broken = dict[str, Topic](), ""
     for part in parts_of(path) or [path]:
-        ended = _inspect_mcap(part, topics) if holds_messages(part) else _inspect_part(part, topics, progress)
+        ended = _inspect_mcap(part, topics) if holds_messages(part) else _inspect_one_bag(part, topics, progress)
         broken = broken or ended
     return topics, broken
 
 
-def _inspect_part(path: Path, topics: dict[str, Topic], progress: Progress | None) -> str:
+def _inspect_one_bag(path: Path, topics: dict[str, Topic], progress: Progress | None) -> str:
     """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not.
 
     Args:
@@ -219,7 +219,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
     for path, value in _yield_leaves(content):
         if isinstance(value, int | float) and path not in topic.fields:
             topic.fields.append(path)
-        if arrival is None and isinstance(value, int | float) and _counts_from_start(path, value):
+        if arrival is None and isinstance(value, int | float) and _is_clock_from_start(path, value):
             topic.clocks.setdefault(path, array("d")).append(value)
         _note_date(topic, path, value, arrival)
 
@@ -230,7 +230,7 @@ def _note_date(topic: Topic, path: str, value: object, arrival: int | None) -> N
     `arrival`: of its message, in nanoseconds since 1970; None where it is not known.
     """
     is_date = is_stamp(value) or (isinstance(value, str) and looks_like_date(value))
-    unit: TimeUnit | None = "s" if is_date else _unit_of_date(value)
+    unit: TimeUnit | None = "s" if is_date else _find_unit_of_date(value)
     if unit is None:
         return
     with suppress(InputError):
@@ -243,24 +243,24 @@ def _note_date(topic: Topic, path: str, value: object, arrival: int | None) -> N
             topic.units[path] = unit
 
 
-def _named_clock(path: str) -> re.Match[str] | None:
+def _match_clock_name(path: str) -> re.Match[str] | None:
     """Return the match of a path whose last word is named as a clock is; None for any other."""
     return CLOCKS.fullmatch(path.split(".")[-1].lower())
 
 
-def _name_clock_unit(path: str) -> Literal["s", "ms", "us", "ns"]:
+def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
     """Return the unit that the name of a clock ends in; seconds where it has none."""
-    match = _named_clock(path)
+    match = _match_clock_name(path)
     unit = None if match is None else match["unit"]
     return next((known for known in UNITS if known == unit), "s")
 
 
-def _counts_from_start(path: str, value: float) -> bool:
+def _is_clock_from_start(path: str, value: float) -> bool:
     """Return whether a number is named as a clock is, and no date of these years."""
-    return not isinstance(value, bool) and _unit_of_date(value) is None and _named_clock(path) is not None
+    return not isinstance(value, bool) and _find_unit_of_date(value) is None and _match_clock_name(path) is not None
 
 
-def _unit_of_date(value: object) -> TimeUnit | None:
+def _find_unit_of_date(value: object) -> TimeUnit | None:
     """Return the unit in which a number, counted from 1970, is a date of these years; None of any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
@@ -278,7 +278,7 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
         if isinstance(message, InputError):
             broken = broken or str(message)
             continue
-        name = message.topic or message_name(path)
+        name = message.topic or make_default_topic(path)
         arrival = None
         with suppress(InputError):
             arrival = None if message.arrival is None else parse_arrival(message.arrival, message.where)

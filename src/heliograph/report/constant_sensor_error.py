@@ -76,7 +76,7 @@ def find_constant_error(
     by_output = zip(variance.T, arrived.T, strict=True)
     deviations = np.sqrt([np.median(claimed[came]) if came.any() else 0.0 for claimed, came in by_output])
     # Innovations in units of the claim, S^-1/2 e, which are white where it holds.
-    whiten = _compute_inverse_roots(s, arrived)
+    whiten = _compute_inverse_square_roots(s, arrived)
     white = np.einsum("tij,tj->ti", whiten, np.where(arrived, e, 0.0))
     # The likeliest error of each output by itself, where its innovations have a usable size.
     candidates = []
@@ -207,7 +207,7 @@ def _find_response(
     return np.where(np.abs(response) * deviations[output] < LARGEST * deviations, response, 0.0)
 
 
-def _compute_inverse_roots(s: Float[np.ndarray, "time m m"], arrived: Float[np.ndarray, "time m"]) -> np.ndarray:
+def _compute_inverse_square_roots(s: Float[np.ndarray, "time m m"], arrived: Float[np.ndarray, "time m"]) -> np.ndarray:
     """Return S^(-1/2) of each row (time, m, m) over the components that arrived; zero for the others.
 
     Zero also where S is not finite; a direction in which S has no positive eigenvalue counts nothing.

@@ -20,7 +20,7 @@ from heliograph.simulation.results.record import Record
 LEAST = 0.2  # of an innovation's deviation: an error of less is not worth a warning
 
 
-def compare_nodes(network: Network, record: Record, inputs: np.ndarray, level: float) -> ConstantError | None:
+def find_disagreeing_node(network: Network, record: Record, inputs: np.ndarray, level: float) -> ConstantError | None:
     """Return the output whose constant error explains why nodes disagree, and that error; None where there is none.
 
     A node that filters by itself takes its sensor's constant error for the state, and its innovations show nothing. So

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from heliograph.report.constant_sensor_error import ConstantError
-from heliograph.report.stuck_sensors import HeldValue
+from heliograph.report.stuck_sensors import StuckValue
 from heliograph.simulation.declared.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
 
@@ -22,7 +22,7 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
     )
 
 
-def say_memory(name: str, test: MemoryTest) -> str:
+def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
     """Return the sentence on innovations that are correlated in time."""
     return (
         f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
@@ -44,7 +44,7 @@ def say_constant_error(name: str, off: ConstantError) -> str:
     )
 
 
-def say_apart(off: ConstantError) -> str:
+def say_node_differs(off: ConstantError) -> str:
     """Return the sentence on the output that differs from what the other nodes say by a constant."""
     return (
         f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
@@ -62,7 +62,7 @@ def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
     )
 
 
-def say_what_to_do(held: HeldValue, refused: bool) -> str:
+def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
     """Return what to do about an output that repeats a value: that it was refused, or how to have it refused."""
     if refused:
         return "what repeated for longer was refused"
@@ -72,7 +72,7 @@ def say_what_to_do(held: HeldValue, refused: bool) -> str:
     )
 
 
-def say_declared(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
+def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
     """Return the sentences on variances that messages declare, of several links after the names of their outputs.
 
     `unit`: of the plant's time.

@@ -1,13 +1,16 @@
 """How large the squared innovations of one recording are, beside what the filter's claim makes of that recording."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import Float
+from heliograph.simulation.results.whiteness import MemoryTest
 
 
-def expect_squares(
+def compute_expected_squares(
     filter: AbstractFilter, data: Float[np.ndarray, "steps m"], inputs: Float[np.ndarray, "steps inputs"]
 ) -> Float[np.ndarray, "steps m"]:
     """Return the mean square of each innovation given its recording, over its variance over all runs: 1 for most.
@@ -27,7 +30,7 @@ def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.nda
 
     Args:
         squares: of innovations in units of their claim, NaN where none is.
-        expected: their means, as `expect_squares` returns them; 1 for most filters.
+        expected: their means, as `compute_expected_squares` returns them; 1 for most filters.
     """
     there = ~np.isnan(squares) & ~np.isnan(expected)
     if not there.any() or not expected[there].any():
@@ -38,3 +41,16 @@ def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.nda
     # expected.
     _, residual_error = average_correlated(np.where(there, squares - ratio * expected, np.nan))
     return ratio, residual_error / mean_expected
+
+
+def scale_size_to_expected(
+    test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
+) -> MemoryTest:
+    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1."""
+    if np.all(expected == 1):
+        return test
+    there = ~np.isnan(white)
+    count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
+    squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
+    power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
+    return replace(test, power=power, power_error=error)

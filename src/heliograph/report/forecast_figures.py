@@ -56,7 +56,7 @@ def draw_forecasts(
         panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
 
 
-def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
+def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
     """Return a text on what is forecast, then a table for each filter.
 
     A table has mean and interval of each state and output, at horizons spread over all.
@@ -70,11 +70,11 @@ def forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
     intro = f"From what had arrived by the last row, as if nothing arrived any more. {sentence_on_inputs}".strip()
     parts: list[Table | Text] = [Text([intro])]
     for node, filters in forecasts.items():
-        parts += [_forecast_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
+        parts += [_make_forecast_table(record, f"{node}/{name}", forecast) for name, forecast in filters.items()]
     return parts
 
 
-def _forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
+def _make_forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
     """Return a table with a row for each of at most MOST horizons: its time, then each state and output."""
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))

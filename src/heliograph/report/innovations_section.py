@@ -24,7 +24,7 @@ BAND = 2.0  # deviations
 LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
 
 
-def group_tested_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
+def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
     """Return the filters in each figure of innovations by its name: one of all, or one of each node of many."""
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
@@ -87,7 +87,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
             "fuses are tested here, and itself on the live page of `heliograph serve`."
         )
     # Pictures by node; one figure with all filters counts as that of the first one's node.
-    figures = {name: filters for name, filters in group_tested_by_figure(health).items() if name in drawings}
+    figures = {name: filters for name, filters in group_tested_filters_by_figure(health).items() if name in drawings}
     text = (
         f"Innovations in claimed standard deviations, one colour an output (of more than {len(COLOURS)} one for all); "
         f"5 of 100 may lie beyond ±{BAND:g}."
@@ -108,7 +108,7 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
             Text([intro]),
             _make_tests_table(health),
             *choose_picture(pictures),
-            *say_not_drawn(not_drawn, "Their numbers are in the table."),
+            *name_undrawn_figures(not_drawn, "Their numbers are in the table."),
             *_make_outputs_table(health),
             *_make_declared_table(health),
         ],
@@ -182,7 +182,7 @@ def _make_declared_table(health: Health) -> list[Table]:
             name = f"{filter.node}/{filter.filter}"
             if len(filter.declared) > 1:
                 name += f": {', '.join(judgement.outputs)}"
-            rows += [[visible(name), *cells] for cells in _make_class_rows(judgement)]
+            rows += [[visible(name), *cells] for cells in _make_declared_class_rows(judgement)]
     caption = (
         "**Declared**: variances that came with the messages, in classes. **Size**: mean square of the innovations "
         "over the claimed one, and where it lies for true variances in 99 of 100 recordings. **Scale**: the factor of "
@@ -192,7 +192,7 @@ def _make_declared_table(health: Health) -> list[Table]:
     return [Table(["filter", "declared", "values", "size", "scale"], rows, caption)] if rows else []
 
 
-def _make_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
+def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
     """Return the cells of each class of declared variances: its range, how many values, size, and scale or "–"."""
     rows = []
     for of_class in judgement.classes:
@@ -212,7 +212,7 @@ def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureCho
     return [PictureChoice("Node", list(map(visible, pictures)), list(pictures.values()))]
 
 
-def say_not_drawn(names: Sequence[str], where: str) -> list[Text]:
+def name_undrawn_figures(names: Sequence[str], where: str) -> list[Text]:
     """Return a text that names what no figure shows for lack of room, and says `where` its numbers are; [] of none."""
     if not names:
         return []

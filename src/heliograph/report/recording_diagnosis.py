@@ -19,27 +19,27 @@ from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.constant_sensor_error import ConstantError, find_constant_error
-from heliograph.report.disagreeing_nodes import compare_nodes
+from heliograph.report.disagreeing_nodes import find_disagreeing_node
 from heliograph.report.doubt_sentences import (
-    say_apart,
     say_constant_error,
-    say_declared,
-    say_memory,
+    say_declared_variances_are_off,
+    say_how_to_refuse_repeats,
+    say_innovations_are_correlated,
+    say_node_differs,
     say_overconfident,
     say_underconfident,
-    say_what_to_do,
 )
-from heliograph.report.expected_squared_innovations import compare_squares, expect_squares
+from heliograph.report.expected_squared_innovations import compute_expected_squares, scale_size_to_expected
 from heliograph.report.forecast_figures import Forecasts, Residuals
 from heliograph.report.sensor_output_health import (
-    ListeningFilter,
+    FilterWithMeasurements,
     OutputHealth,
     judge_outputs_of_filter,
-    list_listeners,
     weighs,
+    yield_filters_with_measurements,
 )
-from heliograph.report.stuck_sensors import HeldValue
-from heliograph.report.wrong_time_unit import doubt_time_unit
+from heliograph.report.stuck_sensors import StuckValue
+from heliograph.report.wrong_time_unit import describe_wrong_time_unit
 from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
 from heliograph.simulation.description.possible import doubt_estimates
 from heliograph.simulation.network import Network
@@ -109,7 +109,7 @@ class Health:
 
     def warnings(self) -> list[str]:
         """Return one line for each reason to doubt the network, the weightiest first."""
-        lines = [*self.record.failures(), *self.describe_held_outputs().values(), *self.possible]
+        lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.possible]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         for link in self.links:
             name = f"{link.node}: {link.component}"
@@ -123,18 +123,18 @@ class Health:
                 )
             elif link.contradicts(FALSE / len(self.links)):
                 lines.append(f"{name} arrived in {link.share:.1%}; the network says that {link.stated_share:.1%} do")
-        lines += [] if self.apart is None else [say_apart(self.apart)]
+        lines += [] if self.apart is None else [say_node_differs(self.apart)]
         lines += [self.time_unit] if self.time_unit else []
         return lines + [line for doubted in self.doubted() for line in self._describe_doubts(doubted)]
 
-    def describe_held_outputs(self) -> dict[tuple[str, str], str]:
+    def describe_stuck_outputs(self) -> dict[tuple[str, str], str]:
         """Return by (node, output) a line for each output that repeats one value for longer than its noise allows.
 
         An output that a node's filter and a central one both use is there once, by the node's.
         """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
         # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
-        held_outputs: dict[str, tuple[str, str, HeldValue]] = {}
+        held_outputs: dict[str, tuple[str, str, StuckValue]] = {}
         for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED):
             output = health.judged.output
             name = output if health.node == Network.FUSED else f"{health.node}: {output}"
@@ -143,7 +143,7 @@ class Health:
         watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
         return {
             (node, output): f"{name} is stuck, or has no noise: {held}, where its noise makes no run as long; "
-            f"{say_what_to_do(held, name in watched)}"
+            f"{say_how_to_refuse_repeats(held, name in watched)}"
             for name, (node, output, held) in held_outputs.items()
         }
 
@@ -152,7 +152,7 @@ class Health:
 
         None of those that use an output which is stuck: their innovations tell of that alone.
         """
-        stuck = {node for node, _ in self.describe_held_outputs()}
+        stuck = {node for node, _ in self.describe_stuck_outputs()}
 
         def is_doubted(health: FilterHealth) -> bool:
             """Return whether one of these filters is trusted, uses nothing that is stuck, and has doubts."""
@@ -174,13 +174,13 @@ class Health:
             yield say_constant_error(name, off)
             if off.nothing_else:
                 return
-        said = say_declared(health.declared, health.unit)
+        said = say_declared_variances_are_off(health.declared, health.unit)
         yield from (f"{name}: {sentence}" for sentence in said)
         if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
             return
         yield from self._describe_sizes(health, health.test)
         if self._has_memory(health, health.test):
-            yield say_memory(name, health.test)
+            yield say_innovations_are_correlated(name, health.test)
 
     def _level_of_one_test(self) -> float:
         """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
@@ -197,10 +197,10 @@ class Health:
         # By output (mean square over its claim, the standard error of that, number of innovations); "" of all together.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
         measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
-        signs = {output: compare_with_claim(*numbers, level / len(measured)) for output, numbers in measured.items()}
+        signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
         if not any(signs.values()):  # none is wrong by itself
             measured = {"": (test.power, test.power_error, health.numbers)}
-            signs = {"": compare_with_claim(*measured[""], level)}
+            signs = {"": judge_size(*measured[""], level)}
         sizes = {output: size for output, (size, _, _) in measured.items()}
         larger = [output for output, sign in signs.items() if sign > 0]
         # One that is far off pulls the estimates, and so makes others a little larger: these are not named.
@@ -212,12 +212,12 @@ class Health:
             if named:  # an only output, or all together, needs no name in the sentence
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
-    def explains_all(self, health: FilterHealth, off: ConstantError) -> bool:
+    def explains_all_innovations(self, health: FilterHealth, off: ConstantError) -> bool:
         """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
         level = self._level_of_one_test() / off.squares.shape[1]
         for column in off.squares.T:
             numbers = int(np.count_nonzero(~np.isnan(column)))
-            if numbers and compare_with_claim(*average_correlated(column), numbers, level):
+            if numbers and judge_size(*average_correlated(column), numbers, level):
                 return False
         test = _test_innovations(off.white)
         return test is None or not self._has_memory(health, test)
@@ -243,7 +243,7 @@ class Health:
                 )
 
 
-def compare_with_claim(size: float, error: float, numbers: int, level: float) -> int:
+def judge_size(size: float, error: float, numbers: int, level: float) -> int:
     """Return 1 or -1 where a mean square of so many numbers is off its claim by its interval and by a tenth; else 0.
 
     The logarithm of a mean square is nearly Gaussian, with its relative error; one that came out small has a small
@@ -277,12 +277,12 @@ def examine(
     Raises:
         ValueError: no network, no record of one recording run through it, inputs of another shape.
     """
-    _check_run(network, record)
+    _check_record(network, record)
     shape = len(record.time), len(network.inputs)
     u: np.ndarray = array("inputs", np.zeros((shape[0], 0)) if inputs is None else inputs, shape)
     # Filters: innovations e in units of their claimed covariance S, S^(-1/2) e, and their correlations over time.
     filters, outputs = [], []
-    for listener in list_listeners(network, record):
+    for listener in yield_filters_with_measurements(network, record):
         advance(f"testing {listener.node}/{listener.name}")
         filters.append(_examine_filter(network, listener, record, u))
         if filters[-1].white is not None:
@@ -298,12 +298,14 @@ def examine(
         (doubted.node, doubted.filter): _find_constant_error(network, health, doubted, u)
         for doubted in health.doubted()
     }
-    apart = None if health.describe_held_outputs() else compare_nodes(network, record, u, FALSE)
+    apart = None if health.describe_stuck_outputs() else find_disagreeing_node(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
     return replace(health, time_unit=_doubt_time_unit(network, health, u))
 
 
-def _examine_filter(network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray) -> FilterHealth:
+def _examine_filter(
+    network: Network, listener: FilterWithMeasurements, record: Record, inputs: np.ndarray
+) -> FilterHealth:
     """Return one filter's innovations in units of its claim (white), and what tests say of them.
 
     There are neither of a filter that claims no covariance, or receives nothing.
@@ -313,8 +315,8 @@ def _examine_filter(network: Network, listener: ListeningFilter, record: Record,
     if filter.claim != "none" and filter.received:
         white = np.asarray(score_innovations(filter, z, inputs)[1])
         test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
-        expected = expect_squares(filter, z, inputs)
-        test = None if test is None else _compare_size(test, white, expected)
+        expected = compute_expected_squares(filter, z, inputs)
+        test = None if test is None else scale_size_to_expected(test, white, expected)
     lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
     return FilterHealth(
         node=node,
@@ -334,13 +336,13 @@ def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> st
     tested = [judged for judged in health.doubted() if judged.test is not None]
     if not tested:
         return ""
-    one = _find_listener(network, health.record, tested[0])
-    return doubt_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
+    one = _find_judged_filter(network, health.record, tested[0])
+    return describe_wrong_time_unit(f"{one.node}/{one.name}", one.filter, one.measurements, inputs, network.inputs)
 
 
-def _find_listener(network: Network, record: Record, judged: FilterHealth) -> ListeningFilter:
+def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) -> FilterWithMeasurements:
     """Return the filter that was judged, with what it listens to."""
-    listeners = list_listeners(network, record)
+    listeners = yield_filters_with_measurements(network, record)
     return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
 
 
@@ -350,11 +352,11 @@ def _find_constant_error(
     """Return the constant error of one output that explains what is doubtful in a filter of several; else None."""
     if judged.test is None:
         return None
-    listener = _find_listener(network, health.record, judged)
+    listener = _find_judged_filter(network, health.record, judged)
     off = find_constant_error(listener.outputs, listener.filter, listener.measurements, inputs)
     if off is None:
         return None
-    off = off._replace(nothing_else=health.explains_all(judged, off))
+    off = off._replace(nothing_else=health.explains_all_innovations(judged, off))
     return off if off.nothing_else or off.explained > MOST else None
 
 
@@ -363,7 +365,7 @@ def _name_time_unit(record: Record) -> str:
     return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
 
 
-def _check_run(network: Network, record: Record) -> None:
+def _check_record(network: Network, record: Record) -> None:
     """Raise ValueError at a record of other filters than the network's, or of several runs."""
     instance("network", network, Network, "a Network")
     instance("record", record, Record, "a Record")
@@ -391,16 +393,3 @@ def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):
         return None
     return MemoryTest.of(came, lags, claimed=True)
-
-
-def _compare_size(
-    test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
-) -> MemoryTest:
-    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1."""
-    if np.all(expected == 1):
-        return test
-    there = ~np.isnan(white)
-    count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
-    squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
-    power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
-    return replace(test, power=power, power_error=error)

@@ -22,7 +22,7 @@ Json: TypeAlias = "str | float | bool | Sequence[Json] | Mapping[str, Json] | No
 
 
 @dataclass(frozen=True)
-class Results:
+class ResultsContent:
     """Results in the form in which they are written.
 
     Attributes:
@@ -42,7 +42,7 @@ def write_results(
     target: Path,
     stages: int,
     compute: Callable[[Advance], T],
-    results_of: Callable[[T], Results],
+    results_of: Callable[[T], ResultsContent],
     needs: Sequence[str] = (),
 ) -> T:
     """Compute, then write figures, report, data and summary to `target`.
@@ -73,7 +73,7 @@ def write_results(
     return outcome
 
 
-def write_into_folder(results: Results, folder: Path) -> None:
+def write_into_folder(results: ResultsContent, folder: Path) -> None:
     """Write figures, report, data and summary into a folder that is there."""
     from heliograph.report.figures import png, svg
 

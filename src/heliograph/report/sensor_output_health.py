@@ -18,10 +18,10 @@ from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.counted_shares import round_to as round_to
-from heliograph.report.expected_squared_innovations import compare_squares, expect_squares
-from heliograph.report.innovation_medians import find_law_medians
+from heliograph.report.expected_squared_innovations import compare_squares, compute_expected_squares
+from heliograph.report.innovation_medians import compute_innovation_medians
 from heliograph.report.results_folder import Json
-from heliograph.report.stuck_sensors import NO_LAW, HeldValue, NoiseLaw, find_held_value, list_noise_laws
+from heliograph.report.stuck_sensors import NO_LAW, NoiseLaw, StuckValue, find_stuck_value, list_noise_laws
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -43,7 +43,7 @@ class FilterErrors(NamedTuple):
     nees_error: float
 
 
-def compare_with_truth(record: Record) -> list[FilterErrors]:
+def compute_filter_errors(record: Record) -> list[FilterErrors]:
     """Return the errors of each filter, the fused ones first; nothing of a record without true states."""
     if record.truth is None:
         return []
@@ -98,7 +98,7 @@ class OutputJudgement(NamedTuple):
     summary: InnovationSummary
     size: float
     size_error: float
-    held: HeldValue | None
+    held: StuckValue | None
 
 
 class OutputHealth(NamedTuple):
@@ -120,7 +120,7 @@ class OutputHealth(NamedTuple):
         return f"{self.name}: {self.judged.summary}{blame}"
 
 
-class ListeningFilter(NamedTuple):
+class FilterWithMeasurements(NamedTuple):
     """A filter with its measurements (time, m) and their names.
 
     trusted: whether the network relies on it. blames: whether its weights say which output is to blame.
@@ -135,9 +135,9 @@ class ListeningFilter(NamedTuple):
     blames: bool = True
 
 
-def list_listeners(network: Network, record: Record) -> Iterator[ListeningFilter]:
+def yield_filters_with_measurements(network: Network, record: Record) -> Iterator[FilterWithMeasurements]:
     """Yield every filter with its measurements: those of the nodes, then central ones."""
-    received, relied_on = record.measurements, _find_relied_on(network)
+    received, relied_on = record.measurements, _list_relied_on_filters(network)
     for node, z in received.items():
         filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
@@ -145,14 +145,16 @@ def list_listeners(network: Network, record: Record) -> Iterator[ListeningFilter
         blaming = weighing & relied_on[node] or weighing
         for name, filter in filters.items():
             trusted, blames = name in relied_on[node], name in blaming
-            yield ListeningFilter(node, name, filter, z, names, trusted=trusted, blames=blames)
+            yield FilterWithMeasurements(node, name, filter, z, names, trusted=trusted, blames=blames)
     every = [f"{node}: {name}" for node in received for name in network.nodes[node].received_names]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter):
-            yield ListeningFilter(Network.FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every)
+            yield FilterWithMeasurements(
+                Network.FUSED, name, fusion, np.concatenate(list(received.values()), axis=1), every
+            )
 
 
-def _find_relied_on(network: Network) -> dict[str, set[str]]:
+def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
     """Return by node the names of the filters that the network relies on: fused ones, else that of the strongest claim.
 
     The first of several such. Others, such as one that takes the mean of a random gain for it, are there to be compared
@@ -177,7 +179,7 @@ def weighs(filter: AbstractFilter) -> bool:
 
 
 def judge_outputs_of_filter(
-    network: Network, listener: ListeningFilter, record: Record, inputs: np.ndarray
+    network: Network, listener: FilterWithMeasurements, record: Record, inputs: np.ndarray
 ) -> list[OutputHealth]:
     """Return the judgement of each output by the innovations of one filter that claims a covariance.
 
@@ -201,8 +203,8 @@ def judge_outputs_of_filter(
         )
     # What they should be by the claim and the law of the noise: variance, median, squares.
     variance = np.asarray(innovations.variance)
-    medians = find_law_medians(network, listener.node, _median_over_time(variance))
-    expected = expect_squares(listener.filter, listener.measurements, inputs)
+    medians = compute_innovation_medians(network, listener.node, _median_over_time(variance))
+    expected = compute_expected_squares(listener.filter, listener.measurements, inputs)
     laws = list_noise_laws(network, listener.node)
     # A message may tell numbers that a filter takes as they are, such as its gain or a flag: their innovations are 0,
     # with variance 0, and are not judged.
@@ -245,7 +247,7 @@ def judge_outputs(
         innovations: value, variance and weight of each (time, m).
         medians: of innovations under a law that is not symmetric (m,); the bias is that beyond these.
         blames: whether weights tell of outliers.
-        expected: of the squares (time, m), as `expect_squares` returns them.
+        expected: of the squares (time, m), as `compute_expected_squares` returns them.
         laws: of each output's noise; None where they are not known.
     """
     # Each bias, with both ends of its interval, less the median that the law of the noise explains.
@@ -267,13 +269,13 @@ def judge_outputs(
                 summary=summary,
                 size=size,
                 size_error=size_error,
-                held=find_held_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i]),
+                held=find_stuck_value(received[:, i], variance[:, i], NO_LAW if laws is None else laws[i]),
             )
         )
     return judged
 
 
-class RecentOutputs:
+class RecentInnovations:
     """Innovations of the newest rows of filters that weigh, summarised by output on request.
 
     `names`: of the received numbers, by node and filter; numbers from 1 where they are not known.
@@ -308,7 +310,7 @@ class RecentOutputs:
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
     outputs: list[OutputHealth] = []
-    for listener in list_listeners(network, record):
+    for listener in yield_filters_with_measurements(network, record):
         if listener.name in record.weighed.get(listener.node, {}):
             outputs += judge_outputs_of_filter(network, listener, record, np.zeros(0))
     return outputs

@@ -61,7 +61,7 @@ def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
     ]
 
 
-class HeldValue(NamedTuple):
+class StuckValue(NamedTuple):
     """The longest run of equal values of one output.
 
     Args:
@@ -85,15 +85,15 @@ class HeldValue(NamedTuple):
         return f"{self.readings} equal values in a row ({self.value:g}) from row {self.first_row + 1}"
 
 
-def find_held_value(
+def find_stuck_value(
     values: Float[np.ndarray, " time"], variance: Float[np.ndarray, " time"], law: NoiseLaw = NO_LAW
-) -> HeldValue | None:
+) -> StuckValue | None:
     """Return the longest run of equal values, if chance makes one as long less than once in 10,000 recordings.
 
     A run of n begins at one of N readings with probability at most N p^(n - 1), where p bounds the probability that a
-    reading equals the one before it. It is what the noise allows (`_bound_repetition`). But a law may repeat a value by
-    itself, as a link that is off gives 0 each time: p is at least the share of the value among the readings outside of
-    the run, and the share of those that equal the one before. Where all values are equal, p = 1/2.
+    reading equals the one before it. It is what the noise allows (`_bound_repetition_probability`). But a law may
+    repeat a value by itself, as a link that is off gives 0 each time: p is at least the share of the value among the
+    readings outside of the run, and the share of those that equal the one before. Where all values are equal, p = 1/2.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.
@@ -114,15 +114,15 @@ def find_held_value(
     if are_all_equal:
         p = 0.5
     else:
-        by_noise = _bound_repetition(received, float(np.median(variance[rows])), law)
-        p = max(by_noise, *_shares_outside_run(received, start, length))
+        by_noise = _bound_repetition_probability(received, float(np.median(variance[rows])), law)
+        p = max(by_noise, *_compute_shares_outside_run(received, start, length))
     if p >= 1:
         return None
     # Logarithm of N p^(n - 1), the expected number of runs as long; p may be 0, of which there is none.
     log_expected = np.log(len(received)) + (length - 1) * np.log(max(p, 1e-300))
     if length < SHORTEST or log_expected > np.log(SELDOM):
         return None
-    return HeldValue(
+    return StuckValue(
         value=float(received[start]),
         first_row=int(rows[start]),
         readings=length,
@@ -131,7 +131,7 @@ def find_held_value(
     )
 
 
-def _bound_repetition(readings: Float[np.ndarray, " n"], variance: float, law: NoiseLaw) -> float:
+def _bound_repetition_probability(readings: Float[np.ndarray, " n"], variance: float, law: NoiseLaw) -> float:
     """Return a bound p of the probability that noise makes a reading equal to the one before it.
 
     Of readings of resolution q, the least difference of two, the innovation has variance S, of which q^2 / 12 may be
@@ -151,7 +151,7 @@ def _bound_repetition(readings: Float[np.ndarray, " n"], variance: float, law: N
         return float(law.share @ np.where(unrounded > 0, erf(resolution / np.sqrt(8 * np.abs(unrounded))), 1.0))
 
 
-def _shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
+def _compute_shares_outside_run(readings: Float[np.ndarray, " n"], start: int, length: int) -> tuple[float, float]:
     """Return shares among the readings outside of a run: those with its value, and those equal to the one before.
 
     The run of `length` begins at reading `start`.

@@ -13,7 +13,7 @@ AS_CLAIMED = 1.25  # ratio of a mean square of innovations to its claim, or the 
 UNITS = {1e-3: "a thousandth of dt, as of times in milliseconds", 1e3: "a thousand times dt, as of times in thousands"}
 
 
-def doubt_time_unit(
+def describe_wrong_time_unit(
     name: str,
     filter: AbstractFilter,
     measurements: Float[np.ndarray, "time m"],

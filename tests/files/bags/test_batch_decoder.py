@@ -9,7 +9,7 @@ pytest.importorskip("rosbags")
 from rosbags.interfaces import Nodetype
 
 import heliograph as hg
-from heliograph.files.bags.batch_decoder import Decoder
+from heliograph.files.bags.batch_decoder import BatchDecoder
 from tests.files import bags
 
 KINDS = bags.STORE.types
@@ -75,17 +75,17 @@ def compared(table, other):
 
 def test_many_at_once_are_bit_for_bit_those_one_by_one(tmp_path, monkeypatch):
     path = bags.write(tmp_path / "bag", messages(3000, np.random.default_rng(0)))
-    used, whole = [], Decoder.append_events
+    used, whole = [], BatchDecoder.append_events
 
     def counted(decoder, batch, table):
         used.append(whole(decoder, batch, table))
         return used[-1]
 
-    monkeypatch.setattr(Decoder, "append_events", counted)
+    monkeypatch.setattr(BatchDecoder, "append_events", counted)
     monkeypatch.setattr("heliograph.files.bags.ros_bag.OFTEN", 400)
     table = hg.files.read_messages(path, NETWORK, SOURCES)
     assert len(table) > 3000 and used == [True] * 8
-    monkeypatch.setattr(Decoder, "append_events", lambda decoder, batch, table: False)
+    monkeypatch.setattr(BatchDecoder, "append_events", lambda decoder, batch, table: False)
     compared(table, hg.files.read_messages(path, NETWORK, SOURCES))
 
 
@@ -102,7 +102,7 @@ def test_one_that_cannot_be_read_is_refused_alone_as_one_by_one(tmp_path, monkey
     assert table.refused == 1 and not table.broken
     assert f"message {at + 1}, logged at" in table.reasons[0] and "a time that was set" in table.reasons[0]
     assert len(table) == len(hg.files.read_messages(good, NETWORK, SOURCES)) - 1  # of two sources that with a stamp
-    monkeypatch.setattr(Decoder, "append_events", lambda decoder, batch, table: False)
+    monkeypatch.setattr(BatchDecoder, "append_events", lambda decoder, batch, table: False)
     compared(table, hg.files.read_messages(path, NETWORK, SOURCES))
 
 

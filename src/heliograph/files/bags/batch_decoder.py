@@ -32,11 +32,11 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class LayoutError(Exception):
+class LayoutNotFixedError(Exception):
     """A message whose fields cannot be read by fixed places: it is decoded alone, which says why if it fails."""
 
 
-class Layout:
+class MessageLayout:
     """Places of the wanted fields in a message, and the lengths of texts and lists that put them there.
 
     Messages of the same size with the same lengths at the same places have all fields at the same places.
@@ -48,20 +48,20 @@ class Layout:
         paths: dotted paths of the numbers to read.
 
     Raises:
-        LayoutError: another encoding, a wanted field that is no number, a message that ends elsewhere.
+        LayoutNotFixedError: another encoding, a wanted field that is no number, a message that ends elsewhere.
     """
 
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
-        """Find where the fields at `paths` stand in messages laid out as `data`; raise LayoutError if one cannot be.
+        """Find where the fields at `paths` stand in messages laid out as `data`; LayoutNotFixedError if one cannot be.
 
         `definitions`: fields of each type of messages; `kind`: type of this one.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
         self._read_length(0)
-        end = self._place_message(4, kind, "")
+        end = self._locate_message_numbers(4, kind, "")
         if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
-            raise LayoutError  # a message is filled up to four bytes at most
+            raise LayoutNotFixedError  # a message is filled up to four bytes at most
 
     def fits(self, table: np.ndarray) -> np.ndarray:
         """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
@@ -74,18 +74,18 @@ class Layout:
         """Return each wanted field of messages of this layout, (messages,)."""
         return {path: _read_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
-    def _place_message(self, begin: int, kind: str, prefix: str) -> int:
+    def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
         """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
 
         `prefix`: path of the message in the whole one, with a dot; "" for that itself.
         """
         if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
-            raise LayoutError
+            raise LayoutNotFixedError
         for name, (node, of) in self._definitions[kind][1]:
-            begin = self._place_field(begin, str(node.name), of, prefix + name)
+            begin = self._locate_field_numbers(begin, str(node.name), of, prefix + name)
         return begin
 
-    def _place_field(self, begin: int, node: str, of: Any, path: str) -> int:
+    def _locate_field_numbers(self, begin: int, node: str, of: Any, path: str) -> int:
         """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
 
         The bytes are those of CDR, the encoding of ROS 2: each number is aligned to its size.
@@ -99,12 +99,12 @@ class Layout:
             path: dotted path of the field in the whole message.
         """
         if node == "NAME":
-            return self._place_message(begin, of, f"{path}.")
+            return self._locate_message_numbers(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
             begin = _align_to_size(begin, 4)
             return begin + 4 + self._read_length(begin)
         if node == "BASE":
-            return self._place_numbers(begin, of[0], 1, [path])
+            return self._locate_numbers_in_row(begin, of[0], 1, [path])
         (item_node, item_of), count = of
         if node == "SEQUENCE":  # the length that it has in this message stands before its items
             begin = _align_to_size(begin, 4)
@@ -112,16 +112,16 @@ class Layout:
         if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
-            return self._place_numbers(begin, item_of[0], count, names)
+            return self._locate_numbers_in_row(begin, item_of[0], count, names)
         for i in range(count):
-            begin = self._place_field(begin, item_node.name, item_of, f"{path}.{i}")
+            begin = self._locate_field_numbers(begin, item_node.name, item_of, f"{path}.{i}")
         return begin
 
-    def _place_numbers(self, begin: int, kind: str, count: int, names: list[str]) -> int:
+    def _locate_numbers_in_row(self, begin: int, kind: str, count: int, names: list[str]) -> int:
         """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last."""
         size = NUMBERS.get(kind)
         if size is None:
-            raise LayoutError
+            raise LayoutNotFixedError
         begin = _align_to_size(begin, size) if count else begin
         for i, name in enumerate(names):
             if name in self._paths:
@@ -133,11 +133,11 @@ class Layout:
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
         if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
-            raise LayoutError
+            raise LayoutNotFixedError
         return length
 
 
-class Decoder:
+class BatchDecoder:
     """Decodes messages of mapped topics, many at once: values, stamps and counts as arrays.
 
     Args:
@@ -147,7 +147,7 @@ class Decoder:
 
     def __init__(self, reader: "AnyReader", sources: Sources):
         self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
-        self._layouts = defaultdict[tuple[str, int], list[Layout]](list)
+        self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
 
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
         """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
@@ -156,7 +156,7 @@ class Decoder:
         """
         try:
             readings = self._read_by_node(batch)
-        except LayoutError:
+        except LayoutNotFixedError:
             return False
         for node, blocks in readings.items():
             # In the order in which the messages came.
@@ -173,23 +173,23 @@ class Decoder:
             )
         return True
 
-    def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[Readings]]":
+    def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[NodeReadings]]":
         """Return the readings of each node, a block for the messages of one topic, size and layout.
 
         Raises:
-            LayoutError: messages that need a look at each.
+            LayoutNotFixedError: messages that need a look at each.
         """
         if not self._is_ros2:  # bags of ROS 1 are encoded otherwise
-            raise LayoutError
+            raise LayoutNotFixedError
         # By topic and size: the numbers of the messages.
-        groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[Readings]](list)
+        groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[NodeReadings]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
         if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
-            raise LayoutError
+            raise LayoutNotFixedError
         for (topic, _), numbers in groups.items():
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
-            for rows, columns in self._iterate_layouts(batch[numbers[0]].connection, table):
+            for rows, columns in self._yield_rows_by_layout(batch[numbers[0]].connection, table):
                 for source, _, places in self._sources.of(topic):
                     # The node and the places of its values, of which there is one: `_list_paths` refuses others.
                     ((node, outputs),) = places.items()
@@ -197,7 +197,7 @@ class Decoder:
                     results[node].append(_convert_columns(np.array(numbers)[rows], columns, source, outputs, size))
         return results
 
-    def _iterate_layouts(
+    def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield the rows that have one layout, and their wanted fields by path, until all messages are covered.
@@ -212,14 +212,14 @@ class Decoder:
         while len(left):
             if index == len(known):
                 paths = {path for source, *_ in self._sources.of(connection.topic) for path in _list_paths(source)}
-                known.append(Layout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
+                known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].read_columns(table[left[fits]])
             left, index = left[~fits], index + 1
 
 
-class Readings(NamedTuple):
-    """Readings of a node: numbers of their messages, times (`NONE`), counts (-1: the message has none), and values.
+class NodeReadings(NamedTuple):
+    """NodeReadings of a node: numbers of their messages, times (`NONE`), counts (-1: the message has none), and values.
 
     Shapes: rows, time and sequence (readings,), values (readings, outputs).
     """
@@ -234,20 +234,20 @@ class Readings(NamedTuple):
 def _list_paths(source: Source) -> list[str]:
     """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
-        raise LayoutError
+        raise LayoutNotFixedError
     stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
-    values = [part for path in source.paths for part in _list_parts(path)]
+    values = [part for path in source.paths for part in _list_component_paths(path)]
     return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
 
 
-def _list_parts(path: str | Computed) -> tuple[str, ...]:
+def _list_component_paths(path: str | Computed) -> tuple[str, ...]:
     """Return the paths of the numbers of which a value is computed; that of the value itself if it is not."""
     return (path,) if isinstance(path, str) else path.parts
 
 
 def _convert_columns(
     rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, size: int
-) -> Readings:
+) -> NodeReadings:
     """Return the readings of one source from the fields of many messages.
 
     Args:
@@ -258,7 +258,7 @@ def _convert_columns(
         size: how many values the node receives.
 
     Raises:
-        LayoutError: a stamp, a count or part of a value that is none, which reading message by message then names.
+        LayoutNotFixedError: a stamp, a count or part of a value that is none; reading message by message then names it.
     """
     values = np.full((len(rows), size), np.nan)
     for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
@@ -270,29 +270,29 @@ def _convert_columns(
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
         time = seconds.astype(np.int64) * SECOND + nanoseconds
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
-            raise LayoutError
+            raise LayoutNotFixedError
         time += source.time.shift
     if source.sequence is None:
-        return Readings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
+        return NodeReadings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
     # A count has to be a whole number from 0 on.
     sequence = columns[source.sequence.path]
     if sequence.dtype.kind not in "iu" or np.any(sequence.astype(np.int64) < 0):
-        raise LayoutError
-    return Readings(rows, time, sequence.astype(np.int64), values, source.sequence.period)
+        raise LayoutNotFixedError
+    return NodeReadings(rows, time, sequence.astype(np.int64), values, source.sequence.period)
 
 
 def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
     """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
 
     Raises:
-        LayoutError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
+        LayoutNotFixedError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
     """
-    numbers = [columns[part].astype(np.float64) for part in _list_parts(path)]
+    numbers = [columns[part].astype(np.float64) for part in _list_component_paths(path)]
     parts = [np.where(np.isfinite(number), number, np.nan) for number in numbers]
     try:
         return parts[0] if isinstance(path, str) else np.asarray(path.of(*parts))
     except InputError:
-        raise LayoutError from None
+        raise LayoutNotFixedError from None
 
 
 def _read_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:

@@ -76,7 +76,7 @@ class Pose:
         return places[:6], places[6:]
 
 
-def pose_of(states: tuple[str, ...]) -> Pose:
+def find_pose_states(states: tuple[str, ...]) -> Pose:
     """Return the pose of the states that are named after axes."""
     axes = (*AXES, *(f"v{axis}" for axis in AXES))
     return Pose(**{axis: axis for axis in axes if axis in states})
@@ -102,7 +102,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     instance("record", record, Record, "a Record")
     path = Path(path)
     check_writable(path, (".mcap",))
-    pose = pose_of(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
+    pose = find_pose_states(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
     pose.places(record.states)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -140,14 +140,14 @@ def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     return [begun + round(at * 1e9) for at in time.tolist()]
 
 
-def _make_topic_word(name: str) -> str:
+def _make_valid_topic_word(name: str) -> str:
     """Return a name as a word of a topic."""
     return re.sub(r"\W", "_", name)
 
 
 def _make_prefix(node: str, filter_name: str) -> str:
     """Return the beginning of the topics of one filter at a node, /NODE/FILTER."""
-    return f"/{_make_topic_word(node)}/{_make_topic_word(filter_name)}"
+    return f"/{_make_valid_topic_word(node)}/{_make_valid_topic_word(filter_name)}"
 
 
 def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
@@ -155,9 +155,9 @@ def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose)
     if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
-        yield f"{prefix}/{_make_topic_word(state)}", NUMBER
+        yield f"{prefix}/{_make_valid_topic_word(state)}", NUMBER
         if claim != "none":
-            yield f"{prefix}/{_make_topic_word(state)}/sd", NUMBER
+            yield f"{prefix}/{_make_valid_topic_word(state)}/sd", NUMBER
 
 
 class _Estimates(NamedTuple):
@@ -204,14 +204,14 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 claimed = None if estimates.claims[k] == "none" else estimates.covariance[k]
                 odometry = _make_odometry(stamp, estimates.mean[k], claimed, places, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry
-            for topic, number in _yield_numbers(estimates, k, record.states):
+            for topic, number in _yield_state_numbers(estimates, k, record.states):
                 yield stamp, topic, types[NUMBER](number)
 
 
-def _yield_numbers(estimates: _Estimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+def _yield_state_numbers(estimates: _Estimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     """Yield topic and number of each state in row k: its mean, and its deviation if the filter claims one."""
     for i, state in enumerate(states):
-        topic = f"{estimates.prefix}/{_make_topic_word(state)}"
+        topic = f"{estimates.prefix}/{_make_valid_topic_word(state)}"
         yield topic, float(estimates.mean[k, i])
         if estimates.claims[k] != "none":
             yield f"{topic}/sd", float(np.sqrt(max(estimates.covariance[k, i, i], 0.0)))
@@ -240,8 +240,8 @@ def _make_odometry(
     vector, point, quaternion = (types[f"{geometry}{name}"] for name in ("Vector3", "Point", "Quaternion"))
     pose_states, twist_states = places
     # Six numbers each, three along the axes and three about them, and their covariance (36,).
-    position, position_covariance = _select_pose(mean, covariance, pose_states)
-    velocity, velocity_covariance = _select_pose(mean, covariance, twist_states)
+    position, position_covariance = _select_pose_and_covariance(mean, covariance, pose_states)
+    velocity, velocity_covariance = _select_pose_and_covariance(mean, covariance, twist_states)
     rotation = quaternion(*_convert_angles_to_quaternion(*position[3:]))
     pose_message = types[f"{geometry}Pose"](position=point(*position[:3]), orientation=rotation)
     twist_message = types[f"{geometry}Twist"](linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
@@ -255,7 +255,7 @@ def _make_odometry(
     )
 
 
-def _select_pose(
+def _select_pose_and_covariance(
     mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"] | None, places: list[int | None]
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
     """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis.

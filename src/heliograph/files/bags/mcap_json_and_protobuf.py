@@ -10,8 +10,8 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from heliograph.files.bags.protobuf import Schema
-from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, DamageError
+from heliograph.files.bags.protobuf import ProtobufSchema
+from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, BagDamagedError
 from heliograph.files.messages.message_files import FileMessage
 from heliograph.files.sources.sources import Sources
 from heliograph.files.text.text_file import CutOffError
@@ -28,7 +28,7 @@ BARE = "protobuf without its schema"
 OTHERS = {BARE, "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's registry that nothing here reads
 
 
-class Channel(NamedTuple):
+class McapChannel(NamedTuple):
     """A channel of an MCAP file: its topic, how its messages are encoded, and the number of their schema."""
 
     topic: str
@@ -36,11 +36,11 @@ class Channel(NamedTuple):
     schema: int
 
 
-class Types(NamedTuple):
-    """Types of a file's messages of Protocol Buffers: the name of one, and the schema that describes it."""
+class ProtobufType(NamedTuple):
+    """Name of a message type of Protocol Buffers, and the schema of the file, by which its messages are decoded."""
 
     name: str
-    schema: Schema
+    schema: ProtobufSchema
 
 
 def holds_messages(path: Path) -> bool:
@@ -89,7 +89,7 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
                 else:
                     yield FileMessage(where, channel.topic, payload, np.datetime64(logged, "ns"))
         except InputError as error:
-            if not isinstance(error, DamageError):
+            if not isinstance(error, BagDamagedError):
                 raise
             yield CutOffError(f"{error}; what was read before it stays")
         except Exception as error:  # whatever damage makes a reader do
@@ -97,30 +97,30 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
             yield CutOffError(f"{why}; what was read before it stays")
 
 
-class _RawMessage(NamedTuple):
+class _StoredMessage(NamedTuple):
     """A message as it stands in the file: its number from 1, its channel, when it was logged, its bytes, known types.
 
     `types`: of messages in Protocol Buffers, by the number of their schema.
     """
 
     number: int
-    channel: Channel
+    channel: McapChannel
     logged: int
     data: bytes
-    types: dict[int, Types]
+    types: dict[int, ProtobufType]
 
 
-def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_RawMessage]:
+def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
 
     Raises:
         ValueError: a topic of the sources in an encoding that is not read.
         Exception: whatever damage leads to.
     """
-    channels, types, count = dict[int, Channel](), dict[int, Types](), 0
+    channels, types, count = dict[int, McapChannel](), dict[int, ProtobufType](), 0
     for kind, content in _read_records(file):
         if kind == SCHEMA:
-            types |= _read_schema(content)
+            types |= _read_protobuf_schemas(content)
         elif kind == CHANNEL:
             number, channel = _read_channel(content, types)
             channels[number] = channel
@@ -130,10 +130,10 @@ def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> 
         elif kind == MESSAGE:
             count += 1
             number, _, logged, _ = HEADER.unpack_from(content)
-            yield _RawMessage(count, channels[number], logged, content[HEADER.size :], types)
+            yield _StoredMessage(count, channels[number], logged, content[HEADER.size :], types)
 
 
-def _decode_payload(where: str, channel: Channel, types: dict[int, Types], data: bytes) -> object:
+def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufType], data: bytes) -> object:
     """Return a message: in JSON its text, in Protocol Buffers its fields, in others None.
 
     Why it is none is returned too, not raised: the reader counts it.
@@ -149,19 +149,19 @@ def _decode_payload(where: str, channel: Channel, types: dict[int, Types], data:
         return fail(f"{where}, {channel.topic}", f"a message of {name}", error)
 
 
-def _read_schema(content: bytes) -> dict[int, Types]:
+def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
     """Return the number of a schema of Protocol Buffers with its types; nothing of another, or of one that is none."""
     name, at = _read_text(content, NUMBER.size)
     encoding, at = _read_text(content, at)
     if encoding != PROTOBUF:
         return {}
     try:
-        return {NUMBER.unpack_from(content)[0]: Types(name, Schema.of(content[at + LENGTH.size :]))}
+        return {NUMBER.unpack_from(content)[0]: ProtobufType(name, ProtobufSchema.of(content[at + LENGTH.size :]))}
     except (ValueError, KeyError):
         return {}
 
 
-def _find_channels(file: BinaryIO) -> list[Channel]:
+def _find_channels(file: BinaryIO) -> list[McapChannel]:
     """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
     # The footer says where the summary begins.
     file.seek(-END.size - len(MAGIC), os.SEEK_END)
@@ -175,12 +175,12 @@ def _find_channels(file: BinaryIO) -> list[Channel]:
     return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
 
 
-def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[Channel]:
+def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
     """Return the channels among records, each behind its schema."""
-    channels, types = list[Channel](), dict[int, Types]()
+    channels, types = list[McapChannel](), dict[int, ProtobufType]()
     for kind, content in records:
         if kind == SCHEMA:
-            types |= _read_schema(content)
+            types |= _read_protobuf_schemas(content)
         channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []
     return channels
 
@@ -189,7 +189,7 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of each record up to the end of the data or the summary; records of chunks by themselves.
 
     Raises:
-        DamageError: a record that is longer than what is left.
+        BagDamagedError: a record that is longer than what is left.
         Exception: whatever else damage leads to.
     """
     from rosbags.rosbag2.storage_mcap import decompress
@@ -200,7 +200,9 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             return
         content = file.read(size)
         if len(head) < RECORD.size or len(content) < size:
-            raise DamageError(str(fail(str(getattr(file, "name", "a chunk")), "whole records", "one that was cut off")))
+            raise BagDamagedError(
+                str(fail(str(getattr(file, "name", "a chunk")), "whole records", "one that was cut off"))
+            )
         if kind != CHUNK:
             yield kind, content
             continue
@@ -211,13 +213,13 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
         yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
 
 
-def _read_channel(content: bytes, types: Mapping[int, Types]) -> tuple[int, Channel]:
+def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
     """Return the number of a channel, and its topic, encoding and schema, of which the types are known."""
     topic, at = _read_text(content, 2 * NUMBER.size)
     encoding, _ = _read_text(content, at)
     (schema,) = NUMBER.unpack_from(content, NUMBER.size)
     encoding = BARE if encoding == PROTOBUF and schema not in types else encoding
-    return NUMBER.unpack_from(content)[0], Channel(topic, encoding, schema)
+    return NUMBER.unpack_from(content)[0], McapChannel(topic, encoding, schema)
 
 
 def _read_text(content: bytes, at: int) -> tuple[str, int]:

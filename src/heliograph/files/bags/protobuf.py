@@ -25,7 +25,7 @@ def _decode_signed(number: int) -> int:
     return number - (1 << 64) if number >> 63 else number
 
 
-class Scalar(NamedTuple):
+class ScalarReader(NamedTuple):
     """How a type of number is read: its wire type, and what makes the number of it."""
 
     wire: int
@@ -38,19 +38,19 @@ def _make_fixed_reader(layout: str) -> Callable[[bytes], Any]:
 
 
 SCALARS = {  # by type of FieldDescriptorProto
-    1: Scalar(FIXED64, _make_fixed_reader("<d")),
-    2: Scalar(FIXED32, _make_fixed_reader("<f")),
-    3: Scalar(VARINT, _decode_signed),
-    4: Scalar(VARINT, int),
-    5: Scalar(VARINT, _decode_signed),
-    6: Scalar(FIXED64, _make_fixed_reader("<Q")),
-    7: Scalar(FIXED32, _make_fixed_reader("<I")),
-    8: Scalar(VARINT, bool),
-    13: Scalar(VARINT, int),
-    15: Scalar(FIXED32, _make_fixed_reader("<i")),
-    16: Scalar(FIXED64, _make_fixed_reader("<q")),
-    17: Scalar(VARINT, _decode_zigzag),
-    18: Scalar(VARINT, _decode_zigzag),
+    1: ScalarReader(FIXED64, _make_fixed_reader("<d")),
+    2: ScalarReader(FIXED32, _make_fixed_reader("<f")),
+    3: ScalarReader(VARINT, _decode_signed),
+    4: ScalarReader(VARINT, int),
+    5: ScalarReader(VARINT, _decode_signed),
+    6: ScalarReader(FIXED64, _make_fixed_reader("<Q")),
+    7: ScalarReader(FIXED32, _make_fixed_reader("<I")),
+    8: ScalarReader(VARINT, bool),
+    13: ScalarReader(VARINT, int),
+    15: ScalarReader(FIXED32, _make_fixed_reader("<i")),
+    16: ScalarReader(FIXED64, _make_fixed_reader("<q")),
+    17: ScalarReader(VARINT, _decode_zigzag),
+    18: ScalarReader(VARINT, _decode_zigzag),
 }
 LENGTHS = {FIXED64: 8, FIXED32: 4}
 
@@ -74,7 +74,7 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Schema:
+class ProtobufSchema:
     """Types that a file describes.
 
     Args:
@@ -86,14 +86,14 @@ class Schema:
     enums: dict[str, dict[int, str]]
 
     @staticmethod
-    def of(data: bytes) -> "Schema":
+    def of(data: bytes) -> "ProtobufSchema":
         """Read a FileDescriptorSet, by the numbers of descriptor.proto; raise ValueError at what is none."""
-        schema = Schema({}, {})
-        for file in _select_fields(data, 1):
+        schema = ProtobufSchema({}, {})
+        for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
             for number, add in ((4, schema._add_message_type), (5, schema._add_enum)):
-                for content in _select_fields(file, number):
+                for content in _list_values_of_field(file, number):
                     add(content, f"{package}." if package else "", syntax == "proto3")
         return schema
 
@@ -106,7 +106,7 @@ class Schema:
             implicit: whether an absent field has its default, as in proto3.
         """
         name, fields = prefix + _read_text_field(data, 1), dict[int, Field]()
-        for content in _select_fields(data, 2):
+        for content in _list_values_of_field(data, 2):
             found = {number: value for number, _, value in read_fields(content)}
             # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
@@ -119,12 +119,14 @@ class Schema:
             )
         self.messages[name] = fields
         for number, add in ((3, self._add_message_type), (4, self._add_enum)):
-            for content in _select_fields(data, number):
+            for content in _list_values_of_field(data, number):
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
         """Read the descriptor of an enumeration into the table of the schema; `implicit`: not used of one."""
-        values = [{number: value for number, _, value in read_fields(content)} for content in _select_fields(data, 2)]
+        values = [
+            {number: value for number, _, value in read_fields(content)} for content in _list_values_of_field(data, 2)
+        ]
         names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
         self.enums[prefix + _read_text_field(data, 1)] = names
 
@@ -251,14 +253,14 @@ def _find_wire_type(field: Field) -> int:
     return SCALARS[field.kind].wire
 
 
-def _select_fields(data: bytes, wanted: int) -> list[bytes]:
+def _list_values_of_field(data: bytes, wanted: int) -> list[bytes]:
     """Return the messages or texts in the fields of a number."""
     return [value for number, _, value in read_fields(data) if number == wanted and isinstance(value, bytes)]
 
 
 def _read_text_field(data: bytes, number: int) -> str:
     """Return the text in the last field of a number; "" where there is none."""
-    return _decode_text((_select_fields(data, number) or [b""])[-1])
+    return _decode_text((_list_values_of_field(data, number) or [b""])[-1])
 
 
 def _decode_text(value: Any) -> str:

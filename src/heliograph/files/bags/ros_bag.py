@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.bags.batch_decoder import Decoder, RawMessage
+from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources.node_reading import Unread
@@ -33,7 +33,7 @@ ENDING = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20,
 BLOCK = 1 << 20  # bytes copied at once
 
 
-class DamageError(InputError):
+class BagDamagedError(InputError):
     """A bag cannot be read beyond a place."""
 
 
@@ -84,7 +84,7 @@ def read_bag(
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_mapped_fields(path, reader, sources)
         # Messages become events, many at once where all of them can.
-        total, done, decoder = sum(counts[topic] for topic in used), 0, Decoder(reader, sources)
+        total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
         try:
             for batch in batch_messages(read_raw_messages(path, reader, used)):
                 if not decoder.append_events(batch, events):
@@ -92,21 +92,21 @@ def read_bag(
                 done += len(batch)
                 if progress is not None:
                     progress(done, total)
-        except DamageError as error:
+        except BagDamagedError as error:
             if strict:
                 raise
             events.broken = f"{error}; what was read before it stays"
-    _note_other_topics(path, sources, counts, events)
+    _note_unmatched_topics(path, sources, counts, events)
 
 
-def _note_other_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
+def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
     """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
 
     `counts`: messages of the bag by topic.
     """
     others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
     if others:
-        events.notes.append(f"{path}: not among the sources: {_join_counts(others)}")
+        events.notes.append(f"{path}: not among the sources: {_format_topic_counts(others)}")
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
     if missing:
         events.notes.append(f"{path}: not in the bag: {_join_names(missing)}")
@@ -125,8 +125,8 @@ def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
         raise fail(str(path), "a bag", "nothing of that name")
     with ExitStack() as stack:
         readable, cut_off = path, ""
-        if path.suffix.lower() == ".mcap" and is_cut_off(path):
-            readable, end = stack.enter_context(copy_whole_part(path))
+        if path.suffix.lower() == ".mcap" and is_mcap_cut_off(path):
+            readable, end = stack.enter_context(make_copy_of_whole_records(path))
             got = f"one that was cut off after {end:,} bytes of whole records"
             cut_off = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
         yield stack.enter_context(_open_reader(path, readable)), cut_off
@@ -159,7 +159,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         topics: names of the topics.
 
     Raises:
-        DamageError: damage, a topic that changes its type; one line with the place.
+        BagDamagedError: damage, a topic that changes its type; one line with the place.
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
     messages = read_messages_in_order(reader, connections) if connections else iter(())
@@ -174,11 +174,13 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
             place = "before any message"
             if count:
                 place = f"after message {count} of its topics, logged at {format_moment(last_logged)}"
-            raise DamageError(str(fail(f"{path}, {place}", "a bag without damage", _format_reason(error)))) from None
+            raise BagDamagedError(
+                str(fail(f"{path}, {place}", "a bag without damage", _format_reason(error)))
+            ) from None
         topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
         if types.setdefault(topic, kind) != kind:
             where = f"{path}, {topic}, logged at {format_moment(last_logged)}"
-            raise DamageError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
+            raise BagDamagedError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
         yield message
         count += 1
 
@@ -299,12 +301,12 @@ def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _join_counts(counts: dict[str, int]) -> str:
+def _format_topic_counts(counts: dict[str, int]) -> str:
     """Return topics, each with its count in brackets."""
     return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
 
 
-def is_cut_off(path: Path) -> bool:
+def is_mcap_cut_off(path: Path) -> bool:
     """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False
@@ -314,7 +316,7 @@ def is_cut_off(path: Path) -> bool:
         return begins and file.read() != MAGIC
 
 
-def measure_whole_records(path: Path) -> int:
+def find_end_of_whole_records(path: Path) -> int:
     """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
     size, end = path.stat().st_size, len(MAGIC)
     # A record: a byte for its kind, eight for the length of its content, and this.
@@ -330,9 +332,9 @@ def measure_whole_records(path: Path) -> int:
 
 
 @contextmanager
-def copy_whole_part(path: Path) -> Iterator[tuple[Path, int]]:
+def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
     """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it."""
-    end = measure_whole_records(path)
+    end = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
         with path.open("rb") as file, copy.open("wb") as whole:

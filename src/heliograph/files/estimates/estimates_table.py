@@ -33,7 +33,9 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in smoothed:  # which may cover the last rows alone
                 parts = _make_columns(record.states, record.units, smoothed[name])
-                columns += [(f"{prefix}smoothed.{key}", _pad_start(values, len(record.time))) for key, values in parts]
+                columns += [
+                    (f"{prefix}smoothed.{key}", _pad_rows_before(values, len(record.time))) for key, values in parts
+                ]
             if predicted is not None and name in predicted.get(node, {}):
                 parts = _make_predicted_columns(predicted[node][name], record)
                 columns += [(f"{prefix}predicted.{key}", values) for key, values in parts]
@@ -65,7 +67,7 @@ def write_estimates(record: Record, path: str | Path, predicted: Predicted | Non
     write_table(estimate_columns(record, predicted), path)
 
 
-def make_header(name: str, unit: str | None) -> str:
+def make_column_header(name: str, unit: str | None) -> str:
     """Return the name of a column, with its unit where there is one."""
     return f"{name} ({unit})" if unit else str(name)
 
@@ -77,12 +79,12 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []
     for i, state in enumerate(states):
-        columns.append((make_header(state, units.get(state)), mean[:, i]))
+        columns.append((make_column_header(state, units.get(state)), mean[:, i]))
         if estimate.claim != "none":
             # Rounding may make a variance negative: its deviation is NaN.
             variance = covariance[:, i, i]
             deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
-            columns.append((make_header(f"{state}.sd", units.get(state)), deviation))
+            columns.append((make_column_header(f"{state}.sd", units.get(state)), deviation))
     # Each attitude is three states, a rotation vector: as a unit quaternion too, named after the first of them.
     for k in range(0, len(estimate.attitude), 3):
         axes = estimate.attitude[k : k + 3]
@@ -93,7 +95,7 @@ def _make_columns(states: Sequence[str], units: Mapping[str, str], estimate: Est
         for i, first in enumerate(states):
             for j, second in enumerate(states[i + 1 :], i + 1):
                 unit = " ".join(units[name] for name in (first, second) if name in units)
-                columns.append((make_header(f"cov.{first}.{second}", unit), covariance[:, i, j]))
+                columns.append((make_column_header(f"cov.{first}.{second}", unit), covariance[:, i, j]))
     # Probabilities of the modes of a Markov chain, (rows, modes).
     if estimate.modes is not None:
         columns += [(f"mode.{m}", values) for m, values in enumerate(np.asarray(estimate.modes).T)]
@@ -112,13 +114,13 @@ def _make_predicted_columns(
         if len(law.mean) != len(record.time):
             raise fail("predicted", f"{len(record.time)} rows, as the record has", f"{len(law.mean)} rows")
         for i, name in enumerate(law.names):
-            columns.append((prefix + make_header(name, units.get(name)), law.mean[:, i]))
+            columns.append((prefix + make_column_header(name, units.get(name)), law.mean[:, i]))
             if law.claim != "none":
-                columns.append((prefix + make_header(f"{name}.sd", units.get(name)), law.deviation[:, i]))
+                columns.append((prefix + make_column_header(f"{name}.sd", units.get(name)), law.deviation[:, i]))
     return columns
 
 
-def _pad_start(values: np.ndarray, rows: int) -> np.ndarray:
+def _pad_rows_before(values: np.ndarray, rows: int) -> np.ndarray:
     """Return a column extended at its start by NaN, or false, to a number of rows."""
     padding = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
     return np.concatenate([padding.astype(values.dtype), values])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.estimates.estimates_table import estimate_columns, make_header
+from heliograph.files.estimates.estimates_table import estimate_columns, make_column_header
 from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail, instance, show_value
@@ -21,7 +21,9 @@ FORECAST = "forecast"  # the column that marks rows, and what stands before the 
 ByFilter = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by node and filter
 
 
-def forecast_columns(record: Record, forecasts: ByFilter, predicted: ByFilter | None = None) -> dict[str, np.ndarray]:
+def make_forecast_columns(
+    record: Record, forecasts: ByFilter, predicted: ByFilter | None = None
+) -> dict[str, np.ndarray]:
     """Return the columns of the estimates, with rows of forecasts below the rows of data.
 
     The column `forecast` is true in the rows of forecasts. What each sensor would measure then stands in the columns
@@ -72,7 +74,7 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predic
         raise fail("forecasts", "those of `forecast`, by node and filter", show_value(forecasts))
     if not forecasts:
         raise fail("forecasts", "one at least", "none")
-    write_table(forecast_columns(record, forecasts, predicted), path)
+    write_table(make_forecast_columns(record, forecasts, predicted), path)
 
 
 def _append_rows(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
@@ -91,5 +93,7 @@ def _make_output_columns(prefix: str, forecast: "heliograph.forecasting.Forecast
         parts = {output: forecast.outputs.mean[:, i], f"{output}.sd": forecast.outputs.deviation[:, i]}
         for name, values in parts.items():
             if not np.isnan(values).all():
-                columns[prefix + make_header(name, unit_of(output))] = np.concatenate([np.full(rows, np.nan), values])
+                columns[prefix + make_column_header(name, unit_of(output))] = np.concatenate(
+                    [np.full(rows, np.nan), values]
+                )
     return columns

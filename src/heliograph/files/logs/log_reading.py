@@ -90,7 +90,7 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
     place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
-    used = _check_signals(place, path, log, sources)
+    used = _find_signal_units(place, path, log, sources)
     yield from log.messages
     notes += log.notes
     if path.is_dir():
@@ -100,7 +100,7 @@ def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> I
         notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
 
 
-def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
+def _find_signal_units(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
     """Return the units of the signals of sources.
 
     Raises:
@@ -110,14 +110,14 @@ def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[s
     for topic in sources.topics:
         if topic not in log.units and not set("+#") & set(topic):
             hint = "; dbc= of LogSources names their database" if not log.units else f"; {remedy}"
-            raise fail(place, f"a message {topic!r} of the sources", f"{_name_near(topic, log.units)}{hint}")
+            raise fail(place, f"a message {topic!r} of the sources", f"{_suggest_names(topic, log.units)}{hint}")
     used = dict[str, None]()
     for topic, signals in log.units.items():
         for mapped in sources.of(topic):
             for path_in_message in mapped.source.fields:
                 name = path_in_message if path_in_message in signals else path_in_message.split(".")[0]
                 if name not in signals and name != STAMP:
-                    got = f"{_name_near(path_in_message, signals)}; {remedy}"
+                    got = f"{_suggest_names(path_in_message, signals)}; {remedy}"
                     raise fail(f"{place}, {topic}", f"a signal {path_in_message!r} of the sources", got)
                 if OR in signals.get(name, "") and len(list_logs(path)) > 1:
                     raise fail(f"{place}, {topic}", f"one unit of {name!r} in all logs", signals[name])
@@ -126,7 +126,7 @@ def _check_signals(place: str, path: Path, log: Log, sources: Sources) -> list[s
     return list(used)
 
 
-def _name_near(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
+def _suggest_names(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
     """Return in words which names there are instead: the closest one, or else the first LISTED."""
     close = get_close_matches(name, known, 1)
     if close:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heliograph.files.logs.log_sources import STAMP, LogSources
-from heliograph.files.logs.vehicle_log import Log, Series, Wanted, merge_series
+from heliograph.files.logs.vehicle_log import Log, MessageSeries, Wanted, merge_series
 from heliograph.numerics.check import error_text, fail
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     # The units of a topic's fields, which a ULog file does not say; of the wanted ones their values over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
-        name: Series(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
+        name: MessageSeries(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
         for name, data in topics.items()
         if wanted(name)
     }

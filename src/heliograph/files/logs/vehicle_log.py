@@ -37,7 +37,7 @@ class Log(NamedTuple):
     bits: Mapping[str, Mapping[str, int]] = MappingProxyType({})
 
 
-class Series(NamedTuple):
+class MessageSeries(NamedTuple):
     """Messages of one name: seconds from the log's begin, and the values of each signal; all of shape (messages,)."""
 
     time: Float[np.ndarray, " messages"]
@@ -56,7 +56,7 @@ def list_logs(path: Path) -> list[Path]:
     return [path] if path.suffix.lower() in LOGS else []
 
 
-def merge_series(path: Path, begin: float, series: Mapping[str, Series]) -> Iterator[FileMessage]:
+def merge_series(path: Path, begin: float, series: Mapping[str, MessageSeries]) -> Iterator[FileMessage]:
     """Yield the messages of several series in order of time.
 
     Args:

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from heliograph.files.bags.ros_bag import is_bag
-from heliograph.files.messages.message_files import LINES, FileMessage, message_name, read_message_file
+from heliograph.files.messages.message_files import LINES, FileMessage, make_default_topic, read_message_file
 from heliograph.files.sources.sources import Sources
-from heliograph.files.text.text_file import kind_of
+from heliograph.files.text.text_file import find_extension
 from heliograph.numerics.check import InputError, fail
 
 LISTED = 8  # files in one line
@@ -24,20 +24,20 @@ def list_files(folder: Path) -> list[Path]:
         ValueError: there is none; one line.
     """
     kinds = (*LINES, ".csv", ".parquet")
-    files = sorted(path for path in folder.iterdir() if path.is_file() and kind_of(path) in kinds)
+    files = sorted(path for path in folder.iterdir() if path.is_file() and find_extension(path) in kinds)
     if not files:
         raise fail(str(folder), "a bag, or a folder with tables or files of lines", "a folder with neither")
     return files
 
 
-def name_topic(path: Path, sources: Sources) -> str:
+def find_topic_of_file(path: Path, sources: Sources) -> str:
     """Return the topic of a file's messages that name none."""
-    return path.name if sources.of(path.name) else message_name(path)
+    return path.name if sources.of(path.name) else make_default_topic(path)
 
 
 def list_used_files(folder: Path, sources: Sources) -> list[Path]:
     """Return the files of a folder that are topics of sources."""
-    return [path for path in list_files(folder) if sources.of(name_topic(path, sources))]
+    return [path for path in list_files(folder) if sources.of(find_topic_of_file(path, sources))]
 
 
 def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputError]:
@@ -51,7 +51,7 @@ def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputE
         got = f"only {_join_names([path.name for path in list_files(folder)])}"
         raise fail(str(folder), f"a file that the sources name, {_join_names(sources.topics)}", got)
     for path in files:
-        topic = name_topic(path, sources)
+        topic = find_topic_of_file(path, sources)
         for message in read_message_file(path):
             if isinstance(message, InputError) or message.topic is not None:
                 yield message
@@ -59,11 +59,11 @@ def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputE
                 yield message._replace(topic=topic)
 
 
-def list_left_files(folder: Path, sources: Sources) -> list[str]:
+def describe_unused_files(folder: Path, sources: Sources) -> list[str]:
     """Return a line on the files that are no topics of sources, and one on the topics that are no files."""
     used = list_used_files(folder, sources)
     rest = [path.name for path in list_files(folder) if path not in used]
-    found = {name_topic(path, sources) for path in used}
+    found = {find_topic_of_file(path, sources) for path in used}
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
     lines = [f"{folder}: not among the sources: {_join_names(rest)}"] if rest else []
     return [*lines, f"{folder}: not in the folder: {_join_names(missing)}"] if missing else lines

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from heliograph.files.sources.message_fields import decode_items, decode_json, fail_of_doubled, parse_number
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
-from heliograph.files.text.text_file import is_text, kind_of, open_text, yield_until_cut_off
+from heliograph.files.text.text_file import find_extension, is_text, open_text, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import parse_instant
 
@@ -42,17 +42,17 @@ class FileMessage(NamedTuple):
 
 def is_message_file(path: Path) -> bool:
     """Return whether a file has lines of messages, by its name."""
-    return kind_of(path) in LINES
+    return find_extension(path) in LINES
 
 
-def message_name(path: Path) -> str:
+def make_default_topic(path: Path) -> str:
     """Return the topic of the messages of a file that name none: its name, without .gz."""
     return path.name.removesuffix(".gz")
 
 
 def table_has_topics(path: Path) -> bool:
     """Return whether a table is a log of messages: it has a column `topic`."""
-    kind = kind_of(path)
+    kind = find_extension(path)
     if kind == ".parquet" and path.is_file():
         return TOPIC in read_parquet_names(path)
     return kind == ".csv" and path.is_file() and TOPIC in read_csv_header(path)
@@ -76,7 +76,7 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     Raises:
         ValueError: the file cannot be read at all; one line.
     """
-    kind = kind_of(path)
+    kind = find_extension(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if kind == ".parquet":
@@ -134,7 +134,7 @@ def convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
 def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file of JSON, one document or one message a line; an error in place of a bad one."""
     with open_text(path) as file:
-        if kind_of(path) == ".json":  # one document, of any number of lines, or one a line
+        if find_extension(path) == ".json":  # one document, of any number of lines, or one a line
             text = file.read()
             try:
                 yield from decode_document(text, str(path))
@@ -189,10 +189,10 @@ def _convert_item(where: str, content: object, doubled: str | None) -> FileMessa
 def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of the rows of a CSV file, or why one cannot be read."""
     for row in read_csv_rows(path, marked=True):
-        yield row if isinstance(row, InputError) else convert_row(row.where, typed_cells(row))
+        yield row if isinstance(row, InputError) else convert_row(row.where, convert_cells(row))
 
 
-def typed_cells(row: CsvRow) -> dict[str, Any]:
+def convert_cells(row: CsvRow) -> dict[str, Any]:
     """Return the cells of a row by name: numbers with every digit of whole ones, None of empty cells, else texts.
 
     A payload stays a text.

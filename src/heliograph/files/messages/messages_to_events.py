@@ -8,23 +8,35 @@ from heliograph.files.bags.ros_bag import Progress, is_bag, parts_of, read_bag
 from heliograph.files.event_table import EventTable
 from heliograph.files.logs.log_reading import read_log
 from heliograph.files.logs.vehicle_log import is_log
-from heliograph.files.messages.folder_of_message_files import is_folder, list_left_files, name_topic, read_folder
+from heliograph.files.messages.folder_of_message_files import (
+    describe_unused_files,
+    find_topic_of_file,
+    is_folder,
+    read_folder,
+)
 from heliograph.files.messages.message_files import (
     TOPIC,
     FileMessage,
     decode_payload,
     is_message_file,
-    message_name,
+    make_default_topic,
     read_message_file,
     table_has_topics,
 )
-from heliograph.files.messages.own_format import NODE, SEQUENCE, OwnMessages, holds_events, is_own, is_table
+from heliograph.files.messages.own_format import (
+    NODE,
+    SEQUENCE,
+    OwnMessageCollector,
+    holds_events,
+    is_own_message,
+    is_table,
+)
 from heliograph.files.sources.message_fields import parse_arrival
 from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.files.stores.store_address import is_store, parse_store
-from heliograph.files.stores.store_tables import StoreTable, ask_store
-from heliograph.files.text.text_file import CutOffError, kind_of
+from heliograph.files.stores.store_tables import StoreTable, query_store
+from heliograph.files.text.text_file import CutOffError, find_extension
 from heliograph.numerics.check import InputError, check_progress, fail, file_path, flag, instance
 from heliograph.simulation.network import Network
 
@@ -71,7 +83,7 @@ def read_messages(
         ValueError: no such file, no bag, sources that do not fit the network or the file, nothing that can be read.
         ModuleNotFoundError: a bag without rosbags (extra "bags"), a log without what reads it ("can", "mdf", "ulog").
     """
-    source = ask_store(parse_store(str(path))) if is_store(path) else file_path("recording", path)
+    source = query_store(parse_store(str(path))) if is_store(path) else file_path("recording", path)
     return read_events(source, network, sources, progress, strict, ignore_unknown)
 
 
@@ -132,9 +144,9 @@ def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
         return named or _holds_own_rows(path)
     if is_bag(path) or is_log(path) or is_folder(path) or holds_events(path) or is_message_file(path):
         return True
-    if kind_of(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
+    if find_extension(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
         return False
-    return message_name(path) in sources or path.name in sources or table_has_topics(path)
+    return make_default_topic(path) in sources or path.name in sources or table_has_topics(path)
 
 
 def _holds_own_rows(source: Path | StoreTable) -> bool:
@@ -151,7 +163,7 @@ def _list_messages(source: Path | StoreTable, sources: Sources | None = None) ->
 
 def _read_own_table(path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
     """Return the events of a table in our own form."""
-    own = OwnMessages(network, path, table=True, ignore_unknown=ignore_unknown)
+    own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _list_messages(path):
         own.add(message, strict)
     return own.events()
@@ -171,13 +183,13 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
     """
     events = None if sources is None else EventTable(network, sources.step_seconds)
     is_rows = isinstance(path, StoreTable) or is_table(path)
-    own = OwnMessages(network, path, table=is_rows, ignore_unknown=False)
+    own = OwnMessageCollector(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
     for message in _list_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
         # What cannot be read is counted with our own form first; at the end with whichever form was used.
-        elif isinstance(message, InputError) or (message.topic is None and is_own(message.content)):
+        elif isinstance(message, InputError) or (message.topic is None and is_own_message(message.content)):
             own.add(message, strict)
         elif events is None or sources is None:
             raise fail(message.where, "a message in our own form, or sources for its topic", message.topic or "none")
@@ -233,9 +245,9 @@ def _append_message(
     """
     topic = message.topic
     if topic is None:
-        topic = path.topic if isinstance(path, StoreTable) else name_topic(path, sources)
+        topic = path.topic if isinstance(path, StoreTable) else find_topic_of_file(path, sources)
     try:
-        if sources.take_word(topic, message.content, message.where):
+        if sources.take_device_word(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
         content = decode_payload(message) if sources.of(topic) else None
@@ -284,7 +296,7 @@ def _append_reading(
     # Clocks of topics whose messages say nothing of their arrival are compared with each other.
     if arrival is None and reading.time is not None and events.dated:
         sources.clocks.note_time(topic, content, reading.time, (single.source for single in sources.of(topic)))
-    events.add(sources.date_as_original(reading, arrival), arrived)
+    events.add(sources.date_copy_as_original(reading, arrival), arrived)
     sources.senders.note_fields(topic, reading.plant, reading.node, content, sources.list_fields(topic))
 
 
@@ -298,7 +310,7 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
         raise InputError(said)
     from_zero = sources.clocks.check_dates(str(path))
     if isinstance(path, Path) and is_folder(path) and not is_log(path):
-        events.notes += list_left_files(path, sources)
+        events.notes += describe_unused_files(path, sources)
         if len(from_zero) > 1:
             remedy = "start= or offset= of hg.files.Stamp says if they are not"
             events.notes.append(f"{path}: times from 0 are taken as of one clock: {', '.join(from_zero)} ({remedy})")

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.files.event_columns import counts_losses
+from heliograph.files.event_columns import node_counts_losses
 from heliograph.files.event_table import EventTable
 from heliograph.files.messages.message_files import FileMessage, read_parquet_names
 from heliograph.files.sources.message_fields import convert_name
 from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import read_csv_header
-from heliograph.files.text.text_file import CutOffError, kind_of
+from heliograph.files.text.text_file import CutOffError, find_extension
 from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, show_value
@@ -32,20 +32,22 @@ def holds_events(path: str | Path) -> bool:
     path = Path(path)
     if not path.is_file() or not is_table(path):
         return False
-    return {NODE, SEQUENCE} <= set(read_parquet_names(path) if kind_of(path) == ".parquet" else read_csv_header(path))
+    return {NODE, SEQUENCE} <= set(
+        read_parquet_names(path) if find_extension(path) == ".parquet" else read_csv_header(path)
+    )
 
 
 def is_table(path: Path) -> bool:
     """Return whether a file has rows, by its name."""
-    return kind_of(path) in (".csv", ".parquet")
+    return find_extension(path) in (".csv", ".parquet")
 
 
-def is_own(content: object) -> bool:
+def is_own_message(content: object) -> bool:
     """Return whether a decoded message is in our own form."""
     return isinstance(content, Mapping) and NODE in content and bool({SEQUENCE, VALUES, INPUTS} & content.keys())
 
 
-class OwnMessages:
+class OwnMessageCollector:
     """Collects messages in our own form in a table of their events, and counts those that cannot be read.
 
     Args:
@@ -56,7 +58,7 @@ class OwnMessages:
     """
 
     def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
-        self.source, self._reader = source, OwnReader(network, str(source), ignore_unknown, table)
+        self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
 
@@ -110,7 +112,7 @@ class OwnMessages:
             self._table.add(reading, arrival)
 
 
-class OwnReader:
+class OwnMessageReader:
     """Reader of messages in our own form.
 
     Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
@@ -136,7 +138,7 @@ class OwnReader:
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         self.steps = TIME_STEP not in network.inputs
-        self._numbered = [name for name in network.names if counts_losses(network, name)]
+        self._numbered = [name for name in network.names if node_counts_losses(network, name)]
         self.numbers: bool | None = None
         self.zero: int | None = None
         self.rounded: int | None = None
@@ -160,7 +162,7 @@ class OwnReader:
         node = row[NODE]
         if node not in self.components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
-        sequence = _parse_whole(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
+        sequence = _parse_whole_number(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         # Without an arrival it arrived when it was measured. A table has the column or not: an empty cell is an error.
         time, dated = self._read_moment(row[TIME], where, TIME)
         arrival = time
@@ -245,7 +247,7 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
     """
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
-        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_items(cell)
+        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_cell_items(cell)
         if numbered and len(parts) == len(names) - 1:
             parts.append("nan" if isinstance(cell, str) else np.nan)
         if len(parts) != len(names):
@@ -256,12 +258,12 @@ def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbe
     return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", may_be_empty=True) for name in names])
 
 
-def _list_items(cell: Any) -> list[Any]:
+def _list_cell_items(cell: Any) -> list[Any]:
     """Return what is in a list or array; anything else as a list of one."""
     return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 
-def _parse_whole(cell: Any, name: str) -> int:
+def _parse_whole_number(cell: Any, name: str) -> int:
     """Return a count with every digit; a float is accepted if it is an exact integer."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))

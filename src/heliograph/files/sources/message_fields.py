@@ -55,7 +55,7 @@ def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
         ValueError: no JSON; one line.
     """
     content, doubled = _decode_json(text, name)
-    return [(item, _name_doubled_field(item, doubled)) for item in _flatten(content)]
+    return [(item, _name_doubled_field(item, doubled)) for item in _flatten_lists(content)]
 
 
 def fail_of_doubled(name: str, field: str) -> InputError:
@@ -107,10 +107,10 @@ def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]])
     return next((field for part in parts if (field := _name_doubled_field(part, doubled)) is not None), None)
 
 
-def _flatten(content: object) -> Iterator[object]:
+def _flatten_lists(content: object) -> Iterator[object]:
     """Yield each item of a list, or of lists in it; what is no list as the one item."""
     for item in content if isinstance(content, list) else [content]:
-        yield from _flatten(item) if isinstance(item, list) else [item]
+        yield from _flatten_lists(item) if isinstance(item, list) else [item]
 
 
 def match_topic(topic: str, pattern: str) -> bool:
@@ -210,7 +210,7 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     """
     stamp = None if isinstance(value, int | float | str) else _read_stamp(value, name)
     if stamp is not None:
-        return _count_nanoseconds(stamp, "ns", name)
+        return _convert_number_to_nanoseconds(stamp, "ns", name)
     # Dates, then numbers in their unit.
     if isinstance(value, str):
         value = parse_number(value) if quoted else value
@@ -224,7 +224,7 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
         raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
     if unit == "step":
         return convert_count(value, name)
-    return _count_nanoseconds(value, unit, name)
+    return _convert_number_to_nanoseconds(value, unit, name)
 
 
 def _read_stamp(value: Any, name: str) -> int | None:
@@ -243,7 +243,7 @@ def _read_stamp(value: Any, name: str) -> int | None:
     return None
 
 
-def _count_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
+def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
     """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it."""
     # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
     is_whole = float(value).is_integer()

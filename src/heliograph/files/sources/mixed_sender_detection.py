@@ -28,12 +28,12 @@ class SenderCounter:
         """
         self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
-            if isinstance(value, str | int) and name not in asked and self._is_name(name):
+            if isinstance(value, str | int) and name not in asked and self._is_sender_name(name):
                 counts = self._counts[topic, plant, node, name]
                 if len(counts) <= MANY:
                     counts[value] += 1
 
-    def lines_now_and_then(self) -> list[str]:
+    def describe_at_powers_of_two_messages(self) -> list[str]:
         """Return what `describe_several_senders` does after 1, 2, 4, 8, ... messages; [] in between, to save time."""
         return self.describe_several_senders() if self._noted & (self._noted - 1) == 0 else []
 
@@ -57,7 +57,7 @@ class SenderCounter:
             )
         return lines
 
-    def _is_name(self, field: str) -> bool:
+    def _is_sender_name(self, field: str) -> bool:
         """Return whether a word of a field's name, as of `entity_id` or `devEui`, says that it names a sender."""
         if field not in self._names:
             words = re.split(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])", field)

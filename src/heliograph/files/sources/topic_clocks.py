@@ -47,7 +47,7 @@ class TopicClocks:
         """Note the time of a message, in nanoseconds since 1970."""
         clock = self._by_topic.get(topic)
         if clock is None:
-            path, value = _find_time(topic, content, sources)
+            path, value = _find_time_field(topic, content, sources)
             clock = TopicClock(path, not (isinstance(value, str) and looks_like_date(value)), time)
             self._by_topic[topic] = clock
         clock.count += 1
@@ -70,7 +70,7 @@ class TopicClocks:
         return from_zero
 
 
-def _find_time(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
+def _find_time_field(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
     """Return path and value of the first time field of some sources that the message has; ("", None) if none."""
     for source in sources:
         if source.time is not None:

@@ -27,13 +27,13 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
         raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
     refusal = next((result["error"] for result in results if "error" in result), None)
     if refusal is not None:
-        raise fail(str(address), "a query that it answers", shorten_line(str(refusal)))
+        raise fail(str(address), "a query that it answers", shorten_answer(str(refusal)))
     # A series has a name, tags that all its rows share, names of columns, and rows of values.
     all_series = [series for result in results for series in result.get("series", ())]
     if any(part.get("partial") for part in (*results, *all_series)):
         raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
     rows = [
-        _join_tags(address, series.get("tags", {}), dict(zip(series["columns"], values, strict=True)))
+        _join_row_with_tags(address, series.get("tags", {}), dict(zip(series["columns"], values, strict=True)))
         for series in all_series
         for values in series["values"]
     ]
@@ -94,7 +94,7 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
     first_measurement = ""
     for number, row in enumerate(rows):
         if "error" in row:
-            raise fail(str(address), "a query that it answers", shorten_line(str(row["error"])))
+            raise fail(str(address), "a query that it answers", shorten_answer(str(row["error"])))
         measurement = str(row.pop("_measurement", ""))
         first_measurement = first_measurement or measurement
         for name in ("result", "table", "_start", "_stop"):
@@ -107,11 +107,11 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
         name, value = str(row.pop("_field")), row.pop("_value")
         # What is left are the time and the tags, which all fields of one row share.
         fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
-        fields |= _join_tags(address, row, {name: value})
+        fields |= _join_row_with_tags(address, row, {name: value})
     return first_measurement, list(joined.values())
 
 
-def _join_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
+def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
     """Return the columns of a row with its tags.
 
     Raises:
@@ -193,7 +193,7 @@ def _make_columns(
     return columns
 
 
-def shorten_line(said: str) -> str:
+def shorten_answer(said: str) -> str:
     """Return what a server says as one line of at most 200 characters."""
     line = " ".join(said.split())
     return line if len(line) <= SAID else f"{line[:SAID]}..."

@@ -42,16 +42,16 @@ class StoreAddress:
         return f"{self.kind}://{host}/{self.database}{f'?table={self.table}' if self.table else ''}"
 
     @property
-    def written_table(self) -> str:
+    def table_for_estimates(self) -> str:
         """Return the table that estimates are written to."""
         return self.table or ESTIMATES
 
-    def named(self, table: str) -> "StoreAddress":
+    def with_table(self, table: str) -> "StoreAddress":
         """Return the address of another table there."""
         return replace(self, table=table)
 
     @property
-    def login(self) -> tuple[str, str]:
+    def user_and_password(self) -> tuple[str, str]:
         """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none."""
         parts = urlsplit(self.url)
         user = os.environ.get(USER) or unquote(parts.username or "")
@@ -123,9 +123,9 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
     """
     from heliograph.numerics.check import fail
 
-    named = [unquote(option) for option in options.split("&") if option]
-    tables = [option.removeprefix("table=") for option in named if option.startswith("table=")]
-    others = [option for option in named if not option.startswith("table=")]
+    with_table = [unquote(option) for option in options.split("&") if option]
+    tables = [option.removeprefix("table=") for option in with_table if option.startswith("table=")]
+    others = [option for option in with_table if not option.startswith("table=")]
     organisation = ""
     if is_influx and len(others) == 1 and others[0].startswith("org="):
         organisation = others.pop().removeprefix("org=")

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.files.estimates.estimates_table import estimate_columns
 from heliograph.files.messages.message_files import FileMessage, convert_row
 from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
-from heliograph.files.table import TIME, columns_of
+from heliograph.files.table import TIME, convert_to_columns
 from heliograph.files.table_rows import Rows
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.process.extras import check_installed
@@ -41,7 +41,7 @@ class StoreTable:
         Raises:
             ValueError: a column of text; one line.
         """
-        columns = columns_of(self.columns, str(self), only)
+        columns = convert_to_columns(self.columns, str(self), only)
         count = len(next(iter(self.columns.values()), ()))
         return Rows(columns, np.arange(1, count + 1), [])
 
@@ -62,7 +62,7 @@ def _convert_cell(cell: object) -> object:
     return float(cell) if isinstance(cell, Decimal) else cell
 
 
-def ask_store(address: StoreAddress) -> StoreTable:
+def query_store(address: StoreAddress) -> StoreTable:
     """Return the rows of a store's query or table.
 
     Raises:
@@ -72,10 +72,10 @@ def ask_store(address: StoreAddress) -> StoreTable:
     if not address.query and not address.table:
         raise fail(str(address), "?query=SELECT... or ?table=NAME behind it", "neither")
     if address.kind in INFLUX:
-        from heliograph.files.stores.influx import ask_influx as ask
+        from heliograph.files.stores.influx import query_influx as ask
     else:
         check_installed(["psycopg"])
-        from heliograph.files.stores.postgres import ask_postgres as ask
+        from heliograph.files.stores.postgres import query_postgres as ask
     return StoreTable(address, *ask(address))
 
 
@@ -96,7 +96,7 @@ def check_store(address: StoreAddress) -> None:
     check(address)
 
 
-def write_columns(
+def write_columns_to_store(
     address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str, origin: np.datetime64 | None
 ) -> None:
     """Write the columns of estimates; times that are seconds since `origin` become dates.
@@ -141,7 +141,7 @@ def read_store(url: str) -> dict[str, np.ndarray]:
         ValueError: the server is away or refuses, no rows, no `time` in InfluxDB's answer, a column of text. One line.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
     """
-    return ask_store(parse_store(url)).rows(None).columns
+    return query_store(parse_store(url)).rows(None).columns
 
 
 def store_estimates(record: Record, url: str, plant: str = "", origin: np.datetime64 | None = None) -> None:
@@ -167,4 +167,4 @@ def store_estimates(record: Record, url: str, plant: str = "", origin: np.dateti
         instance("origin", origin, np.datetime64, "a numpy.datetime64")
     address = parse_store(url)
     check_store(address)
-    write_columns(address, estimate_columns(record), plant, origin)
+    write_columns_to_store(address, estimate_columns(record), plant, origin)

@@ -55,7 +55,7 @@ def find_separator(header: Sequence[str]) -> str | None:
     return next((mark for mark in SEPARATORS if len(header) == 1 and mark in header[0]), None)
 
 
-def names_in(line: str) -> set[str]:
+def guess_names_in_header(line: str) -> set[str]:
     """Return the names that the first line of a table may have, whatever separates them."""
     separators = r"[,;\t|\s]" if line.startswith(COMMENTS) else r"[,;\t|]"
     return {name.strip().strip('"').strip() for name in re.split(separators, line.lstrip("".join(COMMENTS) + " "))} - {

@@ -117,10 +117,10 @@ class CsvReader:
             return []
         self.number += 1
         where = f"{self.source}, row {self.number}"
-        why = fail(where, "a row of CSV", broken) if broken else self._find_fault(where, cells)
+        why = fail(where, "a row of CSV", broken) if broken else self._find_row_error(where, cells)
         return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
 
-    def _find_fault(self, where: str, cells: list[str]) -> InputError | None:
+    def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
         """Return why cells are no row of this table; None if they are."""
         line = ",".join(cells)
         if not is_text(line):

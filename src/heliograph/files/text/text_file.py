@@ -26,7 +26,7 @@ class CutOffError(InputError):
     """A text that ends before its end, or is damaged from somewhere on; what came before may be used."""
 
 
-def kind_of(path: Path) -> str:
+def find_extension(path: Path) -> str:
     """Return the extension of a file in small letters: before .gz where it is packed, ".csv" of a table in a .txt."""
     kind = (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
     return ".csv" if kind == ".txt" and path.is_file() and _begins_as_table(path) else kind
@@ -98,7 +98,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
         except DAMAGE as error:
             raise _describe_damage(path, error) from None
         while not ended:
-            part, ended, damage = _read_part(unpacked, size)
+            part, ended, damage = _read_bytes_of_part(unpacked, size)
             text = rest + decode(part, ended and damage is None)
             end = len(text) if ended and damage is None else text.rfind(b"\n") + 1
             if progress is not None:
@@ -110,7 +110,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
         raise _describe_damage(path, damage)
 
 
-def _read_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
+def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
     """Return so many bytes, or those that are left; whether the file ends with them, and what is damaged there."""
     parts, length = list[bytes](), 0
     try:

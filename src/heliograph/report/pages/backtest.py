@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
-from heliograph.report.results_folder import Json, Results
+from heliograph.report.results_folder import Json, ResultsContent
 from heliograph.report.sensor_output_health import round_to
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class FilterVerdict:
         return f"{self.name}: {failed}; furthest off {worst.describe()}."
 
 
-def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> Results:
+def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> ResultsContent:
     """Return the content of the results folder of a backtest: its figure, page and summary.
 
     Args:
@@ -78,7 +78,7 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
         network: the user's name of the network.
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
-    return Results(
+    return ResultsContent(
         {"coverage": _draw_coverage(found)},
         lambda drawings: make_backtest_page(found, network, drawings, refit),
         _list_all_numbers(found) | ({"refit": refit} if refit else {}),

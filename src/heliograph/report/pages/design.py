@@ -16,7 +16,7 @@ from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
-from heliograph.report.results_folder import Json, Results
+from heliograph.report.results_folder import Json, ResultsContent
 
 MOST = 40  # transmitters that are drawn; the table and the summary hold all
 ROUNDING = 1e-12  # of the total power
@@ -48,9 +48,9 @@ class DesignResults:
     written: str
 
 
-def design_results(results: DesignResults) -> Results:
+def make_design_results(results: DesignResults) -> ResultsContent:
     """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
-    return Results(
+    return ResultsContent(
         draw_figures(results), partial(make_page, results), make_summary(results), partial(write_networks, results)
     )
 

@@ -10,7 +10,7 @@ from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.model.checks.refusals import WORDS
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, VERMILION, WIDTH
-from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, say_not_drawn
+from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, name_undrawn_figures
 from heliograph.report.pages.page import Picture, Table, Text
 from heliograph.report.recording_diagnosis import Health
 from heliograph.report.sensor_output_health import round_to
@@ -59,9 +59,9 @@ def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Tab
     return [
         Table(headers, [_make_link_cells(health, link) for link in health.links], explained if needs_words else ""),
         *picture,
-        *say_not_drawn(not_drawn, "Their numbers are in the table."),
+        *name_undrawn_figures(not_drawn, "Their numbers are in the table."),
         *_list_refused(health),
-        *describe_shared(health.shared),
+        *describe_shared_links(health.shared),
     ]
 
 
@@ -128,7 +128,7 @@ def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
     return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
 
 
-def describe_shared(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+def describe_shared_links(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
     """Return what nodes share as a sentence each; nothing where their links are independent."""
     sentences = [
         f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."

@@ -16,7 +16,7 @@ from heliograph.report.innovations_section import (
     MOST,
     choose_picture,
     label_time_axis,
-    say_not_drawn,
+    name_undrawn_figures,
 )
 from heliograph.report.pages.page import Picture, Section, Text
 from heliograph.report.recording_diagnosis import Health
@@ -54,7 +54,7 @@ def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> li
             title = f"What filters of {visible(node)} predicted, and what arrived"
             pictures[node] = Picture(drawings[name], title, caption)
     not_drawn = [node for node in nodes if node not in pictures]
-    missing = say_not_drawn(not_drawn, "Their predictions are in the table of estimates.")
+    missing = name_undrawn_figures(not_drawn, "Their predictions are in the table of estimates.")
     return [
         Section("Predictions", [Text([intro]), *choose_picture(pictures), *missing]),
         *_make_residual_sections(health, drawings),

@@ -186,7 +186,7 @@ class OpcUa:
         client = _make_client(self.address)
         await client.connect()
         self._client = client
-        for name in self._translator.sources.subscribed:
+        for name in self._translator.sources.subscribed_topics:
             node = _find_node(client, name)
             self._first.add(node.nodeid.to_string())
             self.reporting[name] = await _monitor(client, node, self)

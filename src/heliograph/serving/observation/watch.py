@@ -16,7 +16,7 @@ from heliograph.model.checks.refusals import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
-from heliograph.report.sensor_output_health import RecentOutputs, make_output_row
+from heliograph.report.sensor_output_health import RecentInnovations, make_output_row
 from heliograph.serving.count_totals import FIELDS, CountTotals, counts_of
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import PlantTroubles, TroubleOverview
@@ -90,7 +90,7 @@ class Watch:
         # Of all plants together: services, tests of claims, weighed outputs, counts, what is wrong, batches.
         self.services: list[WatchableService] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
-        self.outputs = RecentOutputs(MEMORY, names or {})
+        self.outputs = RecentInnovations(MEMORY, names or {})
         self.totals, self._overview = CountTotals(), TroubleOverview()
         no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
         self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)

@@ -13,7 +13,7 @@ FAILURES = "failures.json"
 
 
 @dataclass(frozen=True)
-class Failure:
+class FailedJob:
     """A chunk, or a whole setting where `chunk` is None, that failed every time.
 
     `runs` are the first and the last; `key` is the campaign's seed and the numbers that are folded into its key for the
@@ -35,17 +35,17 @@ class Failure:
         return f"setting {self.setting} ({values}), runs {self.runs[0]} to {self.runs[1]}: {self.error}"
 
 
-def read_failures(out: Path) -> list[Failure]:
+def read_failures(out: Path) -> list[FailedJob]:
     """Read failures.json next to the store; return an empty list if there is no such file."""
     path = out / FAILURES
-    return [Failure(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))] if path.is_file() else []
+    return [FailedJob(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))] if path.is_file() else []
 
 
-def describe_failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> Failure:
+def make_failed_job(campaign: Campaign, out: Path, job: Job, reply: Reply) -> FailedJob:
     """Return the failure of a job, with all that is needed to repeat it, from its last reply."""
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
-    return Failure(
+    return FailedJob(
         setting=job.setting,
         parameters=campaign.settings[job.setting],
         chunk=job.chunk,
@@ -57,7 +57,7 @@ def describe_failure(campaign: Campaign, out: Path, job: Job, reply: Reply) -> F
     )
 
 
-def write_failures(out: Path, failures: list[Failure], tried: list[Job]) -> None:
+def write_failures(out: Path, failures: list[FailedJob], tried: list[Job]) -> None:
     """Write failures.json next to the store: these, and earlier ones not tried now; without any, remove the file.
 
     A setting that failed as a whole was tried again where a chunk of it was.
