@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 
-from heliograph.campaign.definition import DIMENSIONS, Campaign, Setting, canonical, versions
+from heliograph.campaign.definition import DIMENSIONS, Campaign, Setting, collect_versions, serialise_setting
 from heliograph.engine.limits import BLOCK
 from heliograph.numerics.check import check_count, check_seed, fail, file_path
 
@@ -88,7 +88,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
         timeout=_read_timeout(table.get("timeout", TIMEOUT), name),
-        versions=versions(),
+        versions=collect_versions(),
     )
 
 
@@ -182,9 +182,9 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     # Equal settings would have equal random keys, and so equal runs.
     seen: dict[str, int] = {}
     for i, setting in enumerate(settings):
-        first = seen.setdefault(canonical(setting), i)
+        first = seen.setdefault(serialise_setting(setting), i)
         if first != i:
-            same = f"the same as setting {first}, {canonical(setting)}"
+            same = f"the same as setting {first}, {serialise_setting(setting)}"
             raise fail(f"{name}, setting {i}", "distinct settings", same)
     return settings
 

@@ -95,7 +95,7 @@ class Campaign:
 
         So other settings may be added or removed without a change of its runs.
         """
-        digest = hashlib.sha256(canonical(self.settings[setting]).encode()).digest()
+        digest = hashlib.sha256(serialise_setting(self.settings[setting]).encode()).digest()
         return int.from_bytes(digest[:4], "big"), int.from_bytes(digest[4:8], "big")
 
     def key(self, setting: int) -> jax.Array:
@@ -115,7 +115,7 @@ class Campaign:
         return json.dumps(asdict(self))
 
 
-def canonical(setting: Setting) -> str:
+def serialise_setting(setting: Setting) -> str:
     """Serialise a setting as text that does not depend on the order of its keys."""
     return json.dumps(setting, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
@@ -126,7 +126,7 @@ def parse_campaign(text: str) -> Campaign:
     return Campaign(**json.loads(text))
 
 
-def versions() -> dict[str, str]:
+def collect_versions() -> dict[str, str]:
     """Return what the stored bytes depend on in addition to the campaign: packages, and configuration of JAX."""
     settings = {name: str(jax.config.values[name]) for name in SETTINGS}
     return _list_versions() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings

@@ -159,7 +159,8 @@ RMSE = PlotColumn("rmse", "RMSE", "rmse_error")
 CLAIMED = PlotColumn("claimed", "claimed standard deviation")
 NEES = PlotColumn("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
 
-Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[StateScore]]  # into the store: settings, steps
+# From settings and steps (numbers from 1) to the scores of each state, read from the store.
+ReadStateScores: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[StateScore]]
 
 
 def write_explore_page_file(results: str | Path, out: str | Path) -> Path:
@@ -186,10 +187,12 @@ def write_explore_page_file(results: str | Path, out: str | Path) -> Path:
     return path
 
 
-def make_explore_page_html(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
+def make_explore_page_html(
+    campaign: Campaign, scores: Sequence[Score], read_state_scores: ReadStateScores | None = None
+) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table.
 
-    `look`: reads scores of single states from the store; without it there are none.
+    `read_state_scores`: reads scores of single states from the store; without it there are none.
     """
     shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
@@ -206,7 +209,7 @@ def make_explore_page_html(campaign: Campaign, scores: Sequence[Score], look: Lo
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
-    return make_explorable_page_html(page, _make_tables(campaign, shown, look))
+    return make_explorable_page_html(page, _make_tables(campaign, shown, read_state_scores))
 
 
 MEANING = (
@@ -241,19 +244,21 @@ def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
     return shown
 
 
-def _make_tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[ExploredTable]:
+def _make_tables(
+    campaign: Campaign, scores: Sequence[Score], read_state_scores: ReadStateScores | None
+) -> list[ExploredTable]:
     """Return the tables of the page: scores over all steps, of all states and of each of several; then over time.
 
     Details of single states take time to read: of as many settings as have some ROWS rows, by those of the first.
     """
     scored = [_convert_to_state_score(score) for score in scores]
-    if look is None:
+    if read_state_scores is None:
         return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
-    detailed = look(settings[:1], steps)
+    detailed = read_state_scores(settings[:1], steps)
     # So many settings with as many rows as the first have some ROWS rows together.
-    detailed += look(settings[1 : ROWS // max(len(detailed), 1)], steps)
+    detailed += read_state_scores(settings[1 : ROWS // max(len(detailed), 1)], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
     at_steps = [detail for detail in detailed if detail.step]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.campaign.definition import Campaign, Chunk, parse_campaign, versions
+from heliograph.campaign.definition import Campaign, Chunk, collect_versions, parse_campaign
 from heliograph.campaign.zarr_store import (
     AxisLabels,
     NetworkDescription,
@@ -112,7 +112,7 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
 
 def _check_versions(campaign: Campaign) -> None:
     """Refuse a worker whose packages or settings are not those that the campaign was begun with (ValueError)."""
-    here = versions()
+    here = collect_versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.campaign.definition import BITWISE, Campaign, Setting, canonical
+from heliograph.campaign.definition import BITWISE, Campaign, Setting, serialise_setting
 from heliograph.campaign.failed_jobs import FAILURES, FailedJob, read_failures
 from heliograph.campaign.summary import SUMMARY, Score, make_score_cells, make_score_headers
 from heliograph.campaign.zarr_store import list_parameter_values
@@ -157,7 +157,7 @@ def _can_be_axis(campaign: Campaign, name: str) -> bool:
     values = list_parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
-    rests = [canonical(_drop_parameter(setting, name)) for setting in campaign.settings]
+    rests = [serialise_setting(_drop_parameter(setting, name)) for setting in campaign.settings]
     return len(set(rests)) < len(rests)
 
 

@@ -112,7 +112,7 @@ WORLD = {
 CLAIM, CLAIM_AXES = "claim", ("setting", "node", "filter")
 
 
-def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
+def list_stored_variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
     """Return the variables that chunks of runs are written to, with their axes and meaning."""
     return ERRORS | (WORLD if campaign.keep == "trajectories" else {})
 
@@ -137,7 +137,7 @@ def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
             _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
         # Variables, empty so far. A file is one chunk of runs of one setting; the claims of a setting are one file.
         sizes = {name: len(values) for name, values in coordinates.items()}
-        for name, (axes, meaning) in variables(campaign).items():
+        for name, (axes, meaning) in list_stored_variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
             chunks = (1, campaign.chunk, *shape[2:])
             _create_array(group, name, axes, shape, chunks, fill=np.nan, attributes={"long_name": meaning})
@@ -259,7 +259,7 @@ def _sync_files(folder: Path, start: str) -> None:
 
 def find_done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """Return {(setting, chunk)} of the chunks of a campaign whose files all exist in the store."""
-    return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in variables(campaign)))
+    return set.intersection(*(set(_find_chunk_files(path / name, 2)) for name in list_stored_variables(campaign)))
 
 
 def find_described_settings(path: Path) -> set[tuple[int, ...]]:
@@ -269,7 +269,7 @@ def find_described_settings(path: Path) -> set[tuple[int, ...]]:
 
 def remove_damaged_chunks(path: Path, campaign: Campaign) -> list[Path]:
     """Remove the files of chunks that do not agree with their checksums; return these files."""
-    files = [file for name in variables(campaign) for file in _find_chunk_files(path / name, 2).values()]
+    files = [file for name in list_stored_variables(campaign) for file in _find_chunk_files(path / name, 2).values()]
     damaged = [file for file in (*files, *_find_chunk_files(path / CLAIM, 1).values()) if not _has_right_checksum(file)]
     for file in damaged:
         file.unlink()

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from heliograph.cli.app_and_option_types import path_option
-from heliograph.cli.sensor_worth import WorthOptions, compute_worth, describe_worth, write_figure
+from heliograph.cli.sensor_worth import WorthOptions, compute_worth, describe_worth, write_worth_figure
 
 DOUBTFUL = 1
 
@@ -70,5 +70,5 @@ def check(
         print()
         for row in describe_worth(worth, steps, runs):
             print(visible(row))
-        write_figure(worth, options)
+        write_worth_figure(worth, options)
     return DOUBTFUL if serious else 0

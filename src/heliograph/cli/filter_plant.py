@@ -73,7 +73,7 @@ def filter_plant(
     return FilteredPlant(
         data=data,
         record=record,
-        written=_select_rows(record, data.rows),
+        written=_select_rows_of_record(record, data.rows),
         forecasts=forecasts,
         predicted=heliograph.forecasting.predict_record(record, data.recording.inputs) if predicts else {},
         doubted=[*data.warnings, *record.failures(), *doubts],
@@ -126,7 +126,7 @@ def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
     return [str(output) for output in summarise_weighed_outputs(network, record)]
 
 
-def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
+def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Record":
     """Return some of the rows of a record, and of its smoothed estimates, which are of its last rows.
 
     `rows`: a mask, (rows,); None for all. What is said of all rows together, as of weighing and uplinks, is left out.
@@ -157,7 +157,7 @@ def _select_rows(record: "Record", rows: "np.ndarray | None") -> "Record":
             node: {name: select(estimate) for name, estimate in filters.items()}
             for node, filters in record.estimates.items()
         },
-        smoothed=None if smoothed is None else _select_rows(smoothed, rows[-len(smoothed.time) :]),
+        smoothed=None if smoothed is None else _select_rows_of_record(smoothed, rows[-len(smoothed.time) :]),
         reports={},
         uplinks={},
         weighed={},

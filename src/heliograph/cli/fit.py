@@ -89,7 +89,7 @@ def fit_and_judge(
     reading: ReadingOptions,
     stop: GentleStop,
 ) -> "FitResults":
-    """Fit the free numbers to the earlier rows, and judge the filters on the later ones.
+    """Fit the free numbers to the earlier rows; return the fit with what the filters make of the later (held-out) ones.
 
     Args:
         network: the network as the user names it, FILE or FILE:NAME.
@@ -124,7 +124,8 @@ def fit_and_judge(
     learned_rows = rows - int(held_out * rows)
     fitted = _fit_with_progress(build, recording, learned_rows, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
-    # How well the later rows were predicted before and after the fit; whether what was predicted then holds.
+    # How well each filter predicted the later rows before and after the fit (log-likelihood), and whether the fitted
+    # laws hold there: the probability integral transforms of those rows are uniform then.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
     changes: list[Change] = []
@@ -133,6 +134,7 @@ def fit_and_judge(
         changes = stop.run_unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
     if changes:
         uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
+    # The law of lost messages, by node of which some were lost.
     advance("looking at losses")
     losses = stop.run_unless_stopped(lambda: _estimate_losses_by_node(start, recording)) or {}
     return FitResults(network, str(measurements), fitted, learned_rows, rows - learned_rows, changes, uniform, losses)
@@ -230,7 +232,7 @@ def _fit_with_progress(
 
 
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
-    """Return the content of the results folder."""
+    """Return what goes into the results folder of a fit: figures, page, summary, network with the fitted numbers."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
     from heliograph.report.results_folder import ResultsContent
@@ -246,7 +248,7 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
-    """Return filters before and after, and losses, for JSON."""
+    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON."""
     # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
     filters: list[Json] = [
         {

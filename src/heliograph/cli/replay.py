@@ -62,7 +62,7 @@ def replay(
     options = ReadingOptions(strict=strict, ignore_unknown=ignore_unknown)
     # Of each plant of the recording the messages that arrive through the link: (arrival, line), by arrival.
     messages_of_plants = []
-    for i, (name, events, origin) in enumerate(_read_events(recording, network, options)):
+    for i, (name, events, origin) in enumerate(_yield_events_of_plants(recording, network, options)):
         received = simulate_link(events, link, seed + i) if trace is None else delay_as_traced(events, trace)
         messages_of_plants.append(encode_messages(received, name if plant is None else plant, origin))
     # Print each line when it is due: as long after the first as it arrived, by `speed` sooner.
@@ -78,7 +78,7 @@ def replay(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _read_events(
+def _yield_events_of_plants(
     location: Path | StoreAddress, reference: str, options: ReadingOptions
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield name, events and date of time 0 of each plant; the date is None where times are no dates.

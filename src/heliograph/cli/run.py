@@ -11,7 +11,7 @@ import heliograph
 from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
 from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
-from heliograph.cli.run_in_blocks import MessagesOfRun, WrittenRowCounts, run_in_blocks
+from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
 from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        said_of_blocks: MessagesOfRun | None = None  # of a long table, which is not read as a whole but in blocks
+        said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
         measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)

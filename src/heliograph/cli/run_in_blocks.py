@@ -26,8 +26,8 @@ class AllRowsNeededError(Exception):
     """Why all rows of a recording are held in memory at once, in words."""
 
 
-class MessagesOfRun(NamedTuple):
-    """Lines on a table that was filtered in blocks: warnings, and what was written."""
+class PrintedLines(NamedTuple):
+    """Lines that the command prints on a table that it filtered in blocks: warnings, and what was written where."""
 
     warnings: list[str]
     summary: list[str]
@@ -41,7 +41,7 @@ def run_in_blocks(
     others: Iterable[str],
     options: ReadingOptions,
     advance: "Advance",
-) -> MessagesOfRun | None:
+) -> PrintedLines | None:
     """Filter a long table of rows of time, and write the estimates to a table.
 
     Args:
@@ -121,7 +121,7 @@ def filter_in_blocks(
     advance: "Advance",
     block: BlockSize = USUAL_BLOCK,
     most: int = MOST,
-) -> MessagesOfRun:
+) -> PrintedLines:
     """Filter the rows of a table and write the estimates, block by block; return what is to be said of it.
 
     Args:
@@ -171,7 +171,7 @@ def filter_in_blocks(
     refused = (
         [describe_refusals(path, "rows", blocks.refused, list(map(str, blocks.reasons)))] if blocks.refused else []
     )
-    return MessagesOfRun(
+    return PrintedLines(
         warnings=[*refused, *blocks.notes, *blocks.doubts, *doubts.list_lines()], summary=[written.describe(out)]
     )
 

@@ -75,7 +75,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
         outages,
         _find_nodes(module, options.added),
         runs=options.runs,
-        inputs=_read_inputs(network.inputs, options.inputs, options.steps),
+        inputs=_parse_inputs(network.inputs, options.inputs, options.steps),
     )
     return worth
 
@@ -111,7 +111,7 @@ def _find_nodes(module: Mapping[str, object], names: Sequence[str]) -> dict[str,
     return found
 
 
-def _read_inputs(names: Sequence[str], words: Sequence[str], steps: int) -> "np.ndarray | None":
+def _parse_inputs(names: Sequence[str], words: Sequence[str], steps: int) -> "np.ndarray | None":
     """Return the inputs of all steps (steps, inputs) from a word NAME=VALUE for each; None of a plant without any."""
     import numpy as np
 
@@ -149,7 +149,7 @@ def describe_worth(worth: "SensorWorth", steps: int, runs: int) -> Iterator[str]
         yield f"best addition: {best.name}, {best.mean_increase:.3g} times the error (geometric mean over states)"
 
 
-def write_figure(worth: "SensorWorth", options: WorthOptions) -> None:
+def write_worth_figure(worth: "SensorWorth", options: WorthOptions) -> None:
     """Write the figure of what sensors are worth, if one is asked for."""
     if options.figure is None:
         return

@@ -12,9 +12,9 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.disk.atomic_files import check_writable, whole_files
-from heliograph.export.c_text import CText, TextOptions, write_c_text
+from heliograph.export.c_text import CText, CTextOptions, generate_header_and_source
 from heliograph.export.late_measurement_window import check_window
-from heliograph.export.step_program import RESERVED, Real, write_step_program
+from heliograph.export.step_program import RESERVED, Real, lower_step_to_c_functions
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
@@ -169,15 +169,15 @@ def make_c_text(
     exported = filter if real == "double" else filter.for_single_precision()
     precision, dtype = ("double", np.float64) if real == "double" else ("single", np.float32)
     kind = f"a {type(filter).__name__} in {precision} precision"
-    form = TextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
+    form = CTextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
     # Loops are not always shorter than what they repeat: for a short source both forms are written.
     forms = (True, False) if size else (False,)
     texts = list[CText]()
     try:
         for in_loops in forms:
             with use_precision(dtype), write_short_programs(in_loops):
-                program = write_step_program(exported, real, prefix, apart, in_loops)
-            texts.append(write_c_text(program, form))
+                program = lower_step_to_c_functions(exported, real, prefix, apart, in_loops)
+            texts.append(generate_header_and_source(program, form))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
     return min(texts, key=lambda text: len(text.source))
@@ -204,7 +204,7 @@ def measure_cost(header: Path, source: Path, received: int, inputs: int, real: R
         folder, name = Path(temporary), source.stem
         for path in (header, source):
             shutil.copy(path, folder)
-        (folder / "main.c").write_text(_write_timer(name, received, inputs, real), encoding="utf-8")
+        (folder / "main.c").write_text(_generate_timer_program(name, received, inputs, real), encoding="utf-8")
         _run_command(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
         timer = ["-D_POSIX_C_SOURCE=199309L", *FLAGS, "main.c", "step.o", "-lm", "-o", "timer"]
         _run_command(compiler, *timer, folder=folder)
@@ -228,7 +228,7 @@ def _run_command(*command: str, folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def _write_timer(name: str, received: int, inputs: int, real: Real) -> str:
+def _generate_timer_program(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
 
     Where a step is refused, as past the end of a schedule, it starts again.

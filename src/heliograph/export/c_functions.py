@@ -49,7 +49,7 @@ def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
     return lines
 
 
-def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
+def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     """Return the text of the functions of C that move the state, in the order of `list_signatures`.
 
     That is `step` alone, or, of a program in two parts, `start_at` (if the state can be set), `predict`, `correct` and
@@ -59,14 +59,14 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
     heads = list_signatures(program, prefix, real)
     if len(program.parts) == 1:
         body = [
-            *_write_measurement_check(program),
-            *_write_inputs_check(program),
-            *_write_part_statements(program, 0, prefix),
+            *_generate_measurement_check(program),
+            *_generate_inputs_check(program),
+            *_generate_part_statements(program, 0, prefix),
             "    return 0;",
         ]
         return [_join_function(heads[0], body)]
-    predict = [*_write_inputs_check(program), *_write_part_statements(program, 0, prefix), "    return 0;"]
-    correct = [*_write_measurement_check(program), *_write_part_statements(program, 1, prefix), "    return 0;"]
+    predict = [*_generate_inputs_check(program), *_generate_part_statements(program, 0, prefix), "    return 0;"]
+    correct = [*_generate_measurement_check(program), *_generate_part_statements(program, 1, prefix), "    return 0;"]
     step = [
         f"    {prefix}_state after = *state;",
         f"    int refused = {prefix}_predict(&after, u);",
@@ -76,7 +76,7 @@ def write_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
         "    *state = after;",
         "    return 0;",
     ]
-    start = [] if program.start_at is None else [_write_start_statements(program, prefix)]
+    start = [] if program.start_at is None else [_generate_start_statements(program, prefix)]
     return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
 
 
@@ -85,12 +85,12 @@ def _join_function(head: str, body: list[str]) -> str:
     return "\n".join([head, "{", *body, "}"])
 
 
-def _write_measurement_check(program: StepProgram) -> list[str]:
+def _generate_measurement_check(program: StepProgram) -> list[str]:
     """Return the statements that refuse infinite components of a measurement."""
     return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
 
 
-def _write_inputs_check(program: StepProgram) -> list[str]:
+def _generate_inputs_check(program: StepProgram) -> list[str]:
     """Return the statements that refuse inputs that are not finite, and a step past the end."""
     lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
     if program.filter.horizon is not None:
@@ -98,7 +98,7 @@ def _write_inputs_check(program: StepProgram) -> list[str]:
     return lines
 
 
-def _write_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
+def _generate_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
     """Return the statements of C that compute a part, refuse what is wrong, and then write all that changed.
 
     `number` is that of the part: of the whole step or the prediction 0, of the correction 1. All is computed into
@@ -116,7 +116,7 @@ def _write_part_statements(program: StepProgram, number: int, prefix: str) -> li
     # The call: a number without axes is passed by value (as [0] of its member), all else as an array.
     read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
     written = [*(f"after.{m.name}" for m in program.members), *(_name_place_of_result(name) for name in part.beside)]
-    arguments = [*read, *part.data, _write_step_number(program, part), *written]
+    arguments = [*read, *part.data, _generate_step_number_expression(program, part), *written]
     call = f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");"
     checks = [
         *(["    if (spoilt[0] != 0U) { return 6; }"] if "spoilt" in flags else []),
@@ -147,7 +147,7 @@ def _name_place_of_result(name: str) -> str:
     return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"
 
 
-def _write_step_number(program: StepProgram, part: PartOfStep) -> str:
+def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> str:
     """Return the C expression for the number of the step that a part belongs to.
 
     A prediction counts the step: a correction's is one less than the state's count.
@@ -157,7 +157,7 @@ def _write_step_number(program: StepProgram, part: PartOfStep) -> str:
     return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"
 
 
-def _write_start_statements(program: StepProgram, prefix: str) -> list[str]:
+def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
     """Return the statements of a start from a given mean and covariance."""
     members = ", ".join(f"after.{m.name}" for m in program.members)
     return [

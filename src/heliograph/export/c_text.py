@@ -8,10 +8,10 @@ from heliograph.disk.quoted_text import visible
 from heliograph.export.c_functions import (
     declare_innovation,
     explain_separate_functions,
+    generate_c_functions,
     list_signatures,
-    write_functions,
 )
-from heliograph.export.late_measurement_window import WindowText, write_window
+from heliograph.export.late_measurement_window import WindowText, generate_window_code
 from heliograph.export.single_precision_notes import explain_ranges, explain_rounding
 from heliograph.export.step_program import Real, StepProgram
 from heliograph.export.struct_layout import lay_out_array, lay_out_struct
@@ -27,7 +27,7 @@ MEANING: dict[Claim, str] = {
 }
 
 
-class TextOptions(NamedTuple):
+class CTextOptions(NamedTuple):
     """Options of the text.
 
     Args:
@@ -54,7 +54,7 @@ class CText(NamedTuple):
     state_bytes: int
 
 
-def write_c_text(program: StepProgram, form: TextOptions) -> CText:
+def generate_header_and_source(program: StepProgram, form: CTextOptions) -> CText:
     """Return header and source of a step in C, with its counts of operations and bytes.
 
     Args:
@@ -68,15 +68,15 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
     counter = [lay_out_array("int64_t", 1)] if program.counts else []
     state_layout = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
-    window = None if form.late is None else write_window(program, form.late, state_layout, prefix, real)
+    window = None if form.late is None else generate_window_code(program, form.late, state_layout, prefix, real)
     # The source has the functions that compute, then those that a device calls.
     starts = [program.initial] if program.start_at is None else [program.initial, program.start_at]
     source = _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
-        functions="\n\n".join(_write_static_function(code) for code in (*starts, *program.computes)),
-        start=_write_initial_state(program),
-        step="\n\n".join([*write_functions(program, prefix, real), *([] if window is None else window.functions)]),
+        functions="\n\n".join(_generate_static_function(code) for code in (*starts, *program.computes)),
+        start=_generate_initial_state_statements(program),
+        step="\n\n".join([*generate_c_functions(program, prefix, real), *([] if window is None else window.functions)]),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
@@ -86,7 +86,7 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     header = _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
-        comment=_write_comment(program, form, window),
+        comment=_generate_header_comment(program, form, window),
         members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _declare_counter(program)),
         innovation=declare_innovation(program, prefix, real),
         window="" if window is None else window.types,
@@ -101,7 +101,7 @@ def write_c_text(program: StepProgram, form: TextOptions) -> CText:
     )
 
 
-def _write_static_function(code: Any) -> str:
+def _generate_static_function(code: Any) -> str:
     """Return the text of a function that only this file knows."""
     text: str = code.definition
     return text.replace(f"void {code.name}(", f"static void {code.name}(", 1)
@@ -112,18 +112,18 @@ def _declare_counter(program: StepProgram) -> list[str]:
     return ["    int64_t step;"] if program.counts else []
 
 
-def _write_initial_state(program: StepProgram) -> str:
+def _generate_initial_state_statements(program: StepProgram) -> str:
     """Return the statements that set the state before the first step."""
     members = ", ".join(f"state->{m.name}" for m in program.members)
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
 
-def find_claim(filter: AbstractFilter, real: Real) -> Claim:
+def find_claim_at_precision(filter: AbstractFilter, real: Real) -> Claim:
     """Return the filter's claim; single precision proves nothing, since its rounding is not bounded."""
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
-def _write_comment(program: StepProgram, form: TextOptions, window: WindowText | None) -> str:
+def _generate_header_comment(program: StepProgram, form: CTextOptions, window: WindowText | None) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
 
     Args:
@@ -131,7 +131,7 @@ def _write_comment(program: StepProgram, form: TextOptions, window: WindowText |
         form: names and options of the text.
         window: the functions for measurements that come late; None where there are none.
     """
-    filter, prefix, claim = program.filter, form.prefix, find_claim(program.filter, form.real)
+    filter, prefix, claim = program.filter, form.prefix, find_claim_at_precision(program.filter, form.real)
     # Beside each measurement, the range of single precision; "" in double.
     ranges = explain_ranges(filter) if form.real == "float" else [""] * filter.received
     rounding = explain_rounding(filter, any(ranges)) if form.real == "float" else []

@@ -81,7 +81,7 @@ class WindowText(NamedTuple):
     size: int
 
 
-def write_window(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
+def generate_window_code(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
     """Return the text of the window of a filter whose plant counts steps, or has a time step among its inputs.
 
     Args:
@@ -104,13 +104,13 @@ def write_window(program: StepProgram, steps: int, state: StructLayout, prefix: 
     return WindowText(
         comment=_explain_window(window, prefix, whole.size),
         types=_declare_window(window, prefix, real),
-        heads=_list_heads(window, prefix, real),
-        functions=_write_functions(window, prefix, real),
+        heads=_list_function_heads(window, prefix, real),
+        functions=_generate_window_functions(window, prefix, real),
         size=whole.size,
     )
 
 
-def _list_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
+def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
     """Return the heads of the window's functions."""
     held, ago = f"{prefix}_window *window", "uint32_t steps" if window.time is None else f"{real} age"
     return [
@@ -181,7 +181,7 @@ def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int)
     ]
 
 
-def _write_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
+def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
     """Return the text of the window's functions, and of those that they share."""
     received, inputs = window.received, window.inputs
     missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"
@@ -192,25 +192,25 @@ def _write_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> 
         "places": f"{window.places}U",
         "rows": f"{window.rows}U",
         "check": "\n".join([*(f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(received)), nothing]),
-        "copy_z": _write_array_copy("row->z", "z", received),
-        "copy_u": _write_array_copy("row->u", "u", inputs),
+        "copy_z": _generate_array_copy("row->z", "z", received),
+        "copy_u": _generate_array_copy("row->u", "u", inputs),
         "received": received,
-        "head": _list_heads(window, prefix, real)[2],
+        "head": _list_function_heads(window, prefix, real)[2],
     }
     late = _LATE_STEP if window.time is None else _LATE_TIME
     if window.time is not None:
-        names |= {"dt": window.time, "rounding": _write_number(window.places * DIGITS[real], real)}
+        names |= {"dt": window.time, "rounding": _format_literal(window.places * DIGITS[real], real)}
     return [text.format(**names) for text in (_PLACE, _RUN, _FILL, _START, _STEP, late)]
 
 
-def _write_array_copy(target: str, source: str, count: int) -> str:
+def _generate_array_copy(target: str, source: str, count: int) -> str:
     """Return the statements that copy an array; none of an empty one."""
     if not count:
         return f"    (void){source};"
     return f"    for (int c = 0; c < {count}; ++c) {{ {target}[c] = {source}[c]; }}"
 
 
-def _write_number(number: float, real: Real) -> str:
+def _format_literal(number: float, real: Real) -> str:
     """Return a literal of the type."""
     return f"{number:.3e}" + ("f" if real == "float" else "")
 

@@ -68,10 +68,10 @@ class StepProgram(NamedTuple):
         return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
 
 
-def write_step_program(
+def lower_step_to_c_functions(
     filter: AbstractFilter, real: Real, prefix: str, apart: bool = False, size: bool = False
 ) -> StepProgram:
-    """Return one step of a filter as functions of C.
+    """Lower one step of a filter from JAX to functions of C; return them with the arrays of the state that they move.
 
     Args:
         filter: the filter.
@@ -101,7 +101,7 @@ def write_step_program(
         initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
         # A state that is nothing but a mean and a covariance can be set to others.
         can_be_set = isinstance(state, Gaussian | SplitMeanGaussian) and apart
-        start_at = _write_start_function(filter, kept, names, prefix, real) if can_be_set else None
+        start_at = _lower_start_to_c(filter, kept, names, prefix, real) if can_be_set else None
     except Unsupported as error:
         raise make_unsupported_error(error.operation, error.where) from None
     mean, covariance = (candidates[n].name for n in holders)
@@ -148,7 +148,7 @@ def _lower_part_to_c(
     kept: Sequence[int] | None = None,
     names: tuple[Sequence[StateMember], Sequence[StateMember]] = ((), ()),
 ) -> Any:
-    """Return a part of a step as a function of C; all its arguments but the measurement are finite.
+    """Lower a part of a step from JAX to a function of C and return that; all arguments but the measurement are finite.
 
     Args:
         part: the part, a function of the state's arrays, the data and the step's number. Its results are in this order
@@ -187,8 +187,8 @@ def _lower_part_to_c(
     )
 
 
-def _write_start_function(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
-    """Return the function of C that makes the members of a state from a mean and a covariance.
+def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+    """Lower to C, and return, the function that makes the members of a state from a mean and a covariance.
 
     Its last result, `none`, is a flag: the arguments are no finite mean, or no covariance. The state keeps factors of
     the covariance. An indefinite matrix is changed by its factoring, so the product of these factors differs from it:

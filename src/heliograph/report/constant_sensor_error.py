@@ -93,11 +93,11 @@ def find_constant_error(
         )
         if candidate is not None:
             candidates.append(candidate)
-    return _choose_candidate(candidates, e, variance, white) if candidates else None
+    return _choose_likeliest_error(candidates, e, variance, white) if candidates else None
 
 
-def _choose_candidate(
-    candidates: "Sequence[_Candidate]",
+def _choose_likeliest_error(
+    candidates: "Sequence[_ErrorCandidate]",
     e: Float[np.ndarray, "time m"],
     variance: Float[np.ndarray, "time m"],
     white: Float[np.ndarray, "time m"],
@@ -129,7 +129,7 @@ def _choose_candidate(
     )
 
 
-class _Candidate(NamedTuple):
+class _ErrorCandidate(NamedTuple):
     """The likeliest constant error of one output, and what it does to the innovations (time, m).
 
     gain: twice the logarithm of its likelihood ratio. response: change of the innovations by an error of one, also
@@ -154,7 +154,7 @@ def _estimate_error(
     white_response: Float[np.ndarray, "time m"],
     received: Bool[np.ndarray, " time"],
     deviation: float,
-) -> _Candidate | None:
+) -> _ErrorCandidate | None:
     """Return the likeliest constant error b of one output; None where the innovations do not depend on it.
 
     b = sum r' w / sum r' r over all rows, with white innovations w and the response r of them to an error of one; its
@@ -175,7 +175,7 @@ def _estimate_error(
     error = agreement / weight
     # Mean of r' w over the rows, and the standard error that their own scatter gives it.
     mean, standard_error_of_mean = average_correlated(np.where(received, row_agreements, np.nan))
-    return _Candidate(
+    return _ErrorCandidate(
         gain=agreement * error,
         output=output,
         error=error,

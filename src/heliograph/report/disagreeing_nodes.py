@@ -1,4 +1,4 @@
-"""Nodes compared with one another: a constant error of one among those that only filter by themselves."""
+"""Nodes that disagree by a constant: the error of one sensor, where each node only filters by itself."""
 
 import numpy as np
 from scipy.special import ndtri
@@ -20,8 +20,10 @@ from heliograph.simulation.results.record import Record
 LEAST = 0.2  # of an innovation's deviation: an error of less is not worth a warning
 
 
-def find_disagreeing_node(network: Network, record: Record, inputs: np.ndarray, level: float) -> ConstantError | None:
-    """Return the output whose constant error explains why nodes disagree, and that error; None where there is none.
+def find_constant_error_between_nodes(
+    network: Network, record: Record, inputs: np.ndarray, level: float
+) -> ConstantError | None:
+    """Return the constant error of one output that explains why nodes disagree; None where there is none.
 
     A node that filters by itself takes its sensor's constant error for the state, and its innovations show nothing. So
     a filter of all nodes' measurements is made, and its innovations judged as those of a centre are. The error has to

@@ -8,14 +8,14 @@ from heliograph.simulation.declared.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
 
 
-def _name_outputs(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
+def _format_outputs_and_sizes(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
     """Return " of y, z" ("" if `outputs` is [""], which means all), and the sizes as text."""
     return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
 
 
 def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
-    of, times = _name_outputs(outputs, sizes)
+    of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
         "something out"
@@ -54,7 +54,7 @@ def say_node_differs(off: ConstantError) -> str:
 
 def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     """Return the sentence on a NIS below its interval; a filter that follows its sensor's slow error has one too."""
-    of, times = _name_outputs(outputs, sizes)
+    of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
         "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "

@@ -19,7 +19,7 @@ from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.report.arrivals import Arrivals, list_arrivals
 from heliograph.report.constant_sensor_error import ConstantError, find_constant_error
-from heliograph.report.disagreeing_nodes import find_disagreeing_node
+from heliograph.report.disagreeing_nodes import find_constant_error_between_nodes
 from heliograph.report.doubt_sentences import (
     say_constant_error,
     say_declared_variances_are_off,
@@ -298,7 +298,7 @@ def examine(
         (doubted.node, doubted.filter): _find_constant_error(network, health, doubted, u)
         for doubted in health.doubted()
     }
-    apart = None if health.describe_stuck_outputs() else find_disagreeing_node(network, record, u, FALSE)
+    apart = None if health.describe_stuck_outputs() else find_constant_error_between_nodes(network, record, u, FALSE)
     health = replace(health, off={place: error for place, error in off.items() if error is not None}, apart=apart)
     return replace(health, time_unit=_doubt_time_unit(network, health, u))
 

@@ -75,7 +75,7 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
         if gap < 1 - frequency - OFF:
             continue
         # Each arrival has to be in a period of its own.
-        line = _fit_narrowest_rows(frequency, rows)
+        line = _fit_periodic_rows(frequency, rows)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
@@ -113,7 +113,7 @@ def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> t
     return float(phases[largest] + gaps[largest] / 2), float(gaps[largest])
 
 
-def _fit_narrowest_rows(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows:
+def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows:
     """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
 
     Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.

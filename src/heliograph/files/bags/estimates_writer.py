@@ -160,7 +160,7 @@ def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose)
             yield f"{prefix}/{_make_valid_topic_word(state)}/sd", NUMBER
 
 
-class _Estimates(NamedTuple):
+class _FilterEstimates(NamedTuple):
     """Estimates of one filter at all times: beginning of its topics, and by row mean, covariance, claim, soundness.
 
     Shapes: mean (rows, n), covariance (rows, n, n), claims and sound (rows,).
@@ -184,7 +184,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
     """
     # Estimates as arrays, once for all rows.
     all_estimates = [
-        _Estimates(
+        _FilterEstimates(
             prefix=_make_prefix(node, name),
             mean=np.asarray(estimate.mean),
             covariance=np.asarray(estimate.covariance),
@@ -208,7 +208,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 yield stamp, topic, types[NUMBER](number)
 
 
-def _yield_state_numbers(estimates: _Estimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+def _yield_state_numbers(estimates: _FilterEstimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     """Yield topic and number of each state in row k: its mean, and its deviation if the filter claims one."""
     for i, state in enumerate(states):
         topic = f"{estimates.prefix}/{_make_valid_topic_word(state)}"

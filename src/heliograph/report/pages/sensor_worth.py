@@ -31,14 +31,14 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     units, limits = units_in(worth.states), _find_limits(worth)
     for panel, i in zip(panels, range(len(worth.states)), strict=True):
-        _draw_state(panel, worth, i, limits)
+        _draw_bars_of_state(panel, worth, i, limits)
         state = label_with_unit(str(worth.states[i]), units)
         panel.set_title(f"{state}: with all nodes {worth.complete.error[i]:.3g}")
     panels[-1].set_xlabel("times the error with all nodes")
     return figure
 
 
-def _draw_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, float]) -> None:
+def _draw_bars_of_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, float]) -> None:
     """Draw a bar for each case, the first one above: the error of state i over that with all nodes.
 
     Beside each bar stands its number, and if errors were drawn its standard error. `limits`: ends of the axis.
