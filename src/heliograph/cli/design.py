@@ -58,7 +58,7 @@ def count_stages(file: "DesignFile") -> int:
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
     import heliograph as hg
-    from heliograph.files.design_file import write_designed_source
+    from heliograph.files.design_file import make_designed_source
     from heliograph.planning.comparisons import totals_about
     from heliograph.report.pages.design import SOURCE, DesignResults
 
@@ -76,5 +76,5 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
         front=hg.planning.error_over_power(file.problem, totals, advance),
         changes=hg.planning.worth_of_changes(best, file.exponent, advance),
         map=None if sites is None else hg.planning.error_over_sites(best, sites.build, sites.x, sites.y, advance),
-        written=write_designed_source(file, SOURCE, best.powers),
+        written=make_designed_source(file, SOURCE, best.powers),
     )

@@ -1,4 +1,4 @@
-"""One plant of `heliograph run`: its rows filtered, forecast, and written."""
+"""One plant of `heliograph run`: its rows filtered and forecast, and its estimates written."""
 
 import warnings
 from pathlib import Path
@@ -120,7 +120,7 @@ def filter_rows(
 
 
 def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
-    """Say of each output how many of its values the filters that weigh them doubted, and their bias, a line each."""
+    """Return a line for each output on how many of its values the filters that weigh them doubted, and their bias."""
     from heliograph.report.sensor_output_health import summarise_weighed_outputs
 
     return [str(output) for output in summarise_weighed_outputs(network, record)]

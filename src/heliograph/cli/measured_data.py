@@ -196,7 +196,7 @@ def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptio
 
 
 def describe_unreadable_messages(path: object, events: "EventTable") -> list[str]:
-    """Say how many messages could not be read, and why, of the first of them; and where the reading ended."""
+    """Return lines: how many messages could not be read, why (of the first of them), and where the reading ended."""
     from heliograph.model.checks.refusals import describe_counts
 
     lines = [events.broken] if events.broken else []
@@ -207,7 +207,7 @@ def describe_unreadable_messages(path: object, events: "EventTable") -> list[str
 
 
 def describe_refusals(path: object, what: str, count: int, reasons: Sequence[str], known: str = "") -> str:
-    """Say how many rows or messages could not be read, how many for `known` reasons, and why, of the first of them."""
+    """Return a line: how many rows or messages were refused, how many for `known` reasons, and why, of the first."""
     more = count - len(reasons)
     others = f"; and {more} more" if more > 0 else ""
     return (

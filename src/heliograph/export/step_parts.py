@@ -48,19 +48,25 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     flags = ("implausible", "spoilt")
     if not apart:
         return [
-            PartOfStep("step", ("z", "u"), _make_step(filter, tree, real), examples=(leaves, z, u, k), beside=flags)
+            PartOfStep(
+                "step", ("z", "u"), _make_step_function(filter, tree, real), examples=(leaves, z, u, k), beside=flags
+            )
         ]
     # Whether a correction weighs components is seen of one.
     _state, innovation = filter.correct(filter.predict(filter.init(), u, 0), z, 0)
     has_weights = innovation.weight is not None
     news = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
     return [
-        PartOfStep("predict", ("u",), _make_prediction(filter, tree, real), examples=(leaves, u, k), beside=flags),
-        PartOfStep("correct", ("z",), _make_correction(filter, tree, real), examples=(leaves, z, k), beside=news),
+        PartOfStep(
+            "predict", ("u",), _make_prediction_function(filter, tree, real), examples=(leaves, u, k), beside=flags
+        ),
+        PartOfStep(
+            "correct", ("z",), _make_correction_function(filter, tree, real), examples=(leaves, z, k), beside=news
+        ),
     ]
 
 
-def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
     """Return the function of a whole step; `tree` is the structure of a state, of which C has the arrays."""
 
     @jax.jit
@@ -74,7 +80,7 @@ def _make_step(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[...,
     return step
 
 
-def _make_prediction(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
     """Return the function of the prediction alone; `tree` is the structure of a state."""
 
     @jax.jit
@@ -90,7 +96,7 @@ def _make_prediction(filter: AbstractFilter, tree: PyTree, real: str) -> Callabl
     return predict
 
 
-def _make_correction(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
     """Return the function of the correction alone, which tells innovation, distance and weights as well."""
 
     @jax.jit

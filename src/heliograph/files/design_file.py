@@ -165,7 +165,7 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
             raise fail(f"{where}, key {key!r}", f"one of {', '.join(known)}", f"an unknown key{hint}")
 
 
-def write_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
+def make_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
     """Return Python source of a designed network, which loads the original from a file in its own folder.
 
     Args:

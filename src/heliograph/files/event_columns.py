@@ -62,12 +62,12 @@ class NodeEvents:
 
     def keep_events(self, which: np.ndarray) -> None:
         """Keep only the events of the mask `which`, (events,)."""
-        columns, matrix = self.arrays(), self.matrix()[which]
+        columns, matrix = self.arrays(), self.value_matrix()[which]
         # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
         self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
         self.values = array("d", matrix.ravel())
 
-    def matrix(self) -> Float[np.ndarray, "events size"]:
+    def value_matrix(self) -> Float[np.ndarray, "events size"]:
         """Return the values, a row for each event."""
         return np.array(self.values).reshape(len(self.time), self.size)
 
@@ -194,7 +194,7 @@ class EventsByArrival(NamedTuple):
     sequence: np.ndarray
     place: np.ndarray
 
-    def of(self, which: np.ndarray) -> "EventsByArrival":
+    def select(self, which: np.ndarray) -> "EventsByArrival":
         """Return some of the events, by number or by mask."""
         return EventsByArrival(*(column[which] for column in self))
 
@@ -224,7 +224,7 @@ def judge_events(
     # The events that are not in the future, and a number for each node, time and count that occurs among them: its
     # identity. Identities are in order of time; of one time inputs come first, as node -1, then nodes and counts.
     candidates = np.flatnonzero(verdicts != FUTURE)
-    some = events.of(candidates)
+    some = events.select(candidates)
     identity = _rank_rows(some.time, some.node, some.sequence)
     # The number of the row that each belongs to, in order of time: that of its time, or one of its own.
     row = _rank_rows(some.time) if joint else identity
@@ -301,7 +301,7 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
 
 
 def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return the number of each row among those that are equal to it, in their order, from 0."""
+    """Return for each row how many equal ones come before it; rows are entries of the columns at one index."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
     first = np.searchsorted(ranks[order], ranks[order])

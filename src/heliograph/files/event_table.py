@@ -325,11 +325,11 @@ class EventTable:
             ValueError: what `recording` refuses.
         """
         events, verdicts = self._judge_events(window, ahead)
-        events = events.of(verdicts == USED)
+        events = events.select(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
         # In order; inputs, of number -1, first at each time.
-        events = events.of(np.lexsort((events.sequence, events.node, events.time)))
+        events = events.select(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
         row, times = number_rows(events.time, self.steps, self._are_rows_joint)
@@ -362,7 +362,7 @@ class EventTable:
 
     def _list_value_matrices(self) -> list[np.ndarray]:
         """Return the values of each node, (events, values), and last those of the inputs, whose number is -1."""
-        return [self.columns[name].matrix() for name in (*self.network.names, INPUTS)]
+        return [self.columns[name].value_matrix() for name in (*self.network.names, INPUTS)]
 
     def _number_value_matrices(self) -> Iterator[tuple[int, str, np.ndarray]]:
         """Yield number, name and values (events, values) of each node, and last of the inputs, whose number is -1."""
@@ -378,7 +378,7 @@ class EventTable:
         events = EventsByArrival(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         if not len(events.time):
             raise fail("events", "at least one", "none")
-        events = events.of(np.lexsort((events.place, events.arrival)))
+        events = events.select(np.lexsort((events.place, events.arrival)))
         uncounted = events.sequence < 0
         events.sequence[uncounted] = count_equal_rows_before(events.node[uncounted], events.time[uncounted])
         # Moments to the nearest step from the first.

@@ -16,7 +16,7 @@ from heliograph.files.recording_rows import (
     order_rows,
 )
 from heliograph.files.table import TIME, convert_to_columns, read_rows, write_table
-from heliograph.files.table_rows import Rows
+from heliograph.files.table_rows import TableRows
 from heliograph.files.table_writer import predict_name_read_back
 from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
@@ -73,7 +73,7 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     reader = RowReader(network, source, strict=True, ignore_unknown=flag("ignore_unknown", ignore_unknown))
     columns = convert_to_columns(table, source, reader.only)
     rows = len(next(iter(columns.values()), ()))
-    return reader.read(Rows(columns, np.arange(1, rows + 1), []))
+    return reader.read(TableRows(columns, np.arange(1, rows + 1), []))
 
 
 def read_recording_rows(
@@ -171,7 +171,7 @@ class RowReader:
             return []
         return [f"{self.source}: rows that came after later ones, used in the order of their times: {self._behind}"]
 
-    def read(self, rows: Rows) -> Recording:
+    def read(self, rows: TableRows) -> Recording:
         """Return the rows that can be read.
 
         Raises:
@@ -222,17 +222,17 @@ class RowReader:
             truth = np.stack(states, axis=1)[begin:]
         return Recording(measurements, u[begin:], time[begin:], truth)
 
-    def read_cells(self, rows: Rows) -> RecordingRows:
+    def read_cells(self, rows: TableRows) -> RecordingRows:
         """Return what stands in the rows that can be read, each by itself.
 
         Raises:
             ValueError: what `read` refuses, but for times that go backwards.
         """
         columns = {self._headers.get(name, name): values for name, values in rows.columns.items()}
-        checks = RowRefusals(self.source, rows.numbers, self._strict)
-        cells = read_cells(columns, self.network, checks)
-        self.refused += [*rows.refused, *checks.refused]
-        return cells.of(checks.good)
+        refusals = RowRefusals(self.source, rows.numbers, self._strict)
+        cells = read_cells(columns, self.network, refusals)
+        self.refused += [*rows.refused, *refusals.refused]
+        return cells.select(refusals.good)
 
 
 def _make_inputs(
@@ -249,7 +249,7 @@ def _make_inputs(
     _warn_of_equal_times(time, source)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
-        u[:, i] = given[name][rows.of] if name in given else seconds_between(time)
+        u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
         if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
             raise fail(f"{source}, row {rows.numbers[fault.row]}, column {name!r}", fault.expected, fault.came)
     return u

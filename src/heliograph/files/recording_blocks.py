@@ -10,7 +10,7 @@ from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.recording import Recording, RowReader
 from heliograph.files.row_order_across_blocks import BlockOrderCheck
 from heliograph.files.table import read_row_blocks
-from heliograph.files.table_rows import Rows
+from heliograph.files.table_rows import TableRows
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network
@@ -79,7 +79,7 @@ class RecordingBlocks:
         if not self.rows:
             raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
 
-    def _yield_recordings(self, parts: Iterable[Rows]) -> Iterator[Recording]:
+    def _yield_recordings(self, parts: Iterable[TableRows]) -> Iterator[Recording]:
         """Yield parts of a table as recordings, each of which goes on from the last row of the one before it."""
         order = BlockOrderCheck(self._path, self._reader.network)
         for rows in parts:

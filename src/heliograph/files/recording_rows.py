@@ -1,4 +1,4 @@
-"""Rows of a table that were read: what stands in them, in which order they are, and which steps they are of."""
+"""Rows of a recording as columns: put in the order of their times, and with the steps that did not arrive."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class RecordingRows(NamedTuple):
     inputs: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
 
-    def of(self, good: np.ndarray | slice) -> "RecordingRows":
+    def select(self, good: np.ndarray | slice) -> "RecordingRows":
         """Return the rows of a mask, of numbers, or of a slice."""
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
         return RecordingRows(self.numbers[good], self.time[good], *parts)
@@ -69,37 +69,37 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
         fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
         for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
     ]
-    kept = cells.of(~is_refused)
+    kept = cells.select(~is_refused)
     latest_so_far = np.maximum.accumulate(kept.time)
     behind = int(np.count_nonzero(kept.time < latest_so_far))
-    return kept.of(np.argsort(kept.time, kind="stable")), refused, behind
+    return kept.select(np.argsort(kept.time, kind="stable")), refused, behind
 
 
 class RowsWithMissing(NamedTuple):
-    """Rows that a recording has, of which some may stand for rows that did not arrive.
+    """Rows of a recording, read or missing: of a missing one the values are NaN, and the time lies between those read.
 
     Attributes:
         numbers: their numbers in the table, from 1.
-        of: index of the row that was read from which each is taken: its own, or the one before it.
+        read_row: index of the row that was read from which each is taken: its own, or the one before it.
         arrived: whether it was read itself.
     """
 
     numbers: np.ndarray
-    of: np.ndarray
+    read_row: np.ndarray
     arrived: np.ndarray
 
     def fill(self, values: np.ndarray) -> np.ndarray:
         """Return values of these rows, NaN where one did not arrive."""
-        filled = np.array(values[self.of], dtype=np.float64)
+        filled = np.array(values[self.read_row], dtype=np.float64)
         filled[~self.arrived] = np.nan
         return filled
 
     def fill_times(self, time: np.ndarray) -> np.ndarray:
         """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
         missing = np.flatnonzero(~self.arrived)
-        filled = np.array(time[self.of])
+        filled = np.array(time[self.read_row])
         # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
-        before, after = self.of[missing], np.minimum(self.of[missing] + 1, len(time) - 1)
+        before, after = self.read_row[missing], np.minimum(self.read_row[missing] + 1, len(time) - 1)
         numbers = self.numbers[self.arrived]
         share = np.maximum(self.numbers[missing] - numbers[before], 0) / np.maximum(numbers[after] - numbers[before], 1)
         moved = share * (time[after] - time[before]).astype(np.float64)

@@ -57,24 +57,24 @@ class BlockOrderCheck:
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
         rows = ordered if self.last is None else _join_times(self.last, ordered)
         if (row := find_backwards_row(rows.time)) is not None:
-            raise self._make_refusal(rows.of(slice(row - 1, row + 1)), "a time that does not go backwards")
-        self.last = ordered.of(slice(-1, None))
+            raise self._make_refusal(rows.select(slice(row - 1, row + 1)), "a time that does not go backwards")
+        self.last = ordered.select(slice(-1, None))
         if self._first is None:
-            self._first = ordered.of(slice(1))
+            self._first = ordered.select(slice(1))
         if self._rows_are_steps:
             return
         # A step of more than a year, and rows out of order, in whichever blocks: the rows behind the step may all have
         # stamps that were not set, which a block cannot tell.
         if len(jumps := np.flatnonzero(np.diff(rows.time) > _year_in_unit_of(rows.time))):
-            self._jump = rows.of(slice(int(jumps[0]), int(jumps[0]) + 2))
+            self._jump = rows.select(slice(int(jumps[0]), int(jumps[0]) + 2))
         if (row := find_backwards_row(came.time)) is not None:
-            self._disordered = came.of(slice(row - 1, row + 1))
+            self._disordered = came.select(slice(row - 1, row + 1))
         if self._jump is not None and self._disordered is not None:
             raise self._make_refusal(self._disordered, "times in order, in a recording with steps of more than a year")
         # What the block left out is compared with all rows at the end: its earliest and its latest stand for it.
-        left_out = came.of(~np.isin(came.numbers, ordered.numbers))
+        left_out = came.select(~np.isin(came.numbers, ordered.numbers))
         if len(left_out.numbers):
-            self._left_out.append(left_out.of(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
+            self._left_out.append(left_out.select(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
     def check_left_out_rows(self) -> None:
         """Check that all rows that blocks left out are more than a year outside of all that stay.
@@ -89,7 +89,7 @@ class BlockOrderCheck:
         for rows in self._left_out:
             for row in range(2):
                 if first - year <= rows.time[row] <= last + year:
-                    raise self._make_refusal(_join_times(self.last, rows.of(slice(row, row + 1))), "times in order")
+                    raise self._make_refusal(_join_times(self.last, rows.select(slice(row, row + 1))), "times in order")
 
     def _make_refusal(self, rows: RecordingRows, expected: str) -> RowsNotInBlocksError:
         """Return the error that names the second of two rows."""

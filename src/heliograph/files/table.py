@@ -11,7 +11,7 @@ from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
 from heliograph.files.parquet_columns import read_parquet_blocks
-from heliograph.files.table_rows import Rows, convert_to_nanoseconds, convert_to_numbers, join_rows
+from heliograph.files.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers, join_rows
 from heliograph.files.table_writer import open_table
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress, find_extension
@@ -108,7 +108,7 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
     return read_rows(file_path("table", path), None, strict=True).columns
 
 
-def read_rows(path: Path, only: Container[str] | None, strict: bool) -> Rows:
+def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRows:
     """Read the rows of a file, or those of its columns that are among `only`.
 
     Raises:
@@ -126,7 +126,7 @@ def read_row_blocks(
     strict: bool,
     block: BlockSize = USUAL_BLOCK,
     progress: Progress | None = None,
-) -> Iterator[Rows]:
+) -> Iterator[TableRows]:
     """Yield the rows of a file in parts, of those of its columns that are among `only`.
 
     Args:
@@ -150,7 +150,7 @@ def read_row_blocks(
         raise fail(str(path), "a table with a header and rows", "an empty file")
     if plugin is not None:
         columns = convert_to_columns(plugin(path), str(path), only)
-        yield Rows(columns, np.arange(1, len(next(iter(columns.values()), ())) + 1), [])
+        yield TableRows(columns, np.arange(1, len(next(iter(columns.values()), ())) + 1), [])
     elif kind == ".csv":
         yield from read_csv_blocks(path, only, strict, block.bytes, progress)
     else:

@@ -10,7 +10,7 @@ from heliograph.numerics.check import InputError, fail
 EXACT = 2**53  # up to here doubles hold every whole number
 
 
-class Rows(NamedTuple):
+class TableRows(NamedTuple):
     """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
 
     columns: dict[str, np.ndarray]
@@ -18,24 +18,24 @@ class Rows(NamedTuple):
     refused: list[InputError]
 
 
-def join_rows(parts: Iterable[Rows]) -> Rows:
+def join_rows(parts: Iterable[TableRows]) -> TableRows:
     """Return the rows of several parts of a table, one after the other."""
     parts = list(parts)
     filled = [part for part in parts if len(part.numbers)] or parts[-1:]
     names = filled[0].columns if filled else ()
     columns = {name: _join_column([part.columns[name] for part in filled]) for name in names}
     numbers = np.concatenate([np.zeros(0, dtype=np.int64), *(part.numbers for part in filled)])
-    return Rows(columns, numbers, [error for part in parts for error in part.refused])
+    return TableRows(columns, numbers, [error for part in parts for error in part.refused])
 
 
 def _join_column(parts: list[np.ndarray]) -> np.ndarray:
-    """Return the parts of a column as one, of a kind that holds all of them.
+    """Return the parts of a column, one after the other, as dates, float64 or int64: what holds all of them.
 
-    Before the first date of a column of dates all cells are empty; numbers that int64 alone tells apart stay so where
-    all are whole.
+    A part of int64 has numbers too large for doubles. So the column stays int64 where all its numbers are whole, since
+    float64 would round the large ones.
     """
     kinds = {part.dtype.kind for part in parts}
-    if "M" in kinds:
+    if "M" in kinds:  # a part without dates has empty cells alone, as those before the first date
         parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
     elif kinds == {"i", "f"} and all(_are_whole_numbers(part) for part in parts):
         parts = [part.astype(np.int64) for part in parts]

@@ -70,7 +70,7 @@ def compared(table, other):
     for node, columns in table.columns.items():
         expected = other.columns[node]
         assert [columns.time, columns.arrival, columns.sequence] == [expected.time, expected.arrival, expected.sequence]
-        np.testing.assert_array_equal(columns.matrix(), expected.matrix())  # bit for bit, NaN where NaN
+        np.testing.assert_array_equal(columns.value_matrix(), expected.value_matrix())  # bit for bit, NaN where NaN
 
 
 def test_many_at_once_are_bit_for_bit_those_one_by_one(tmp_path, monkeypatch):

@@ -67,12 +67,12 @@ class MessageLayout:
         """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
         fits = np.ones(len(table), dtype=bool)
         for begin, length in self.lengths.items():
-            fits &= _read_column(table, begin, "uint32") == length
+            fits &= _decode_column(table, begin, "uint32") == length
         return fits
 
     def read_columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return each wanted field of messages of this layout, (messages,)."""
-        return {path: _read_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
+        return {path: _decode_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
     def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
         """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
@@ -219,7 +219,7 @@ class BatchDecoder:
 
 
 class NodeReadings(NamedTuple):
-    """NodeReadings of a node: numbers of their messages, times (`NONE`), counts (-1: the message has none), and values.
+    """Readings of a node: numbers of their messages, times (`NONE`: none), counts (-1: none), and values.
 
     Shapes: rows, time and sequence (readings,), values (readings, outputs).
     """
@@ -295,7 +295,7 @@ def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.nda
         raise LayoutNotFixedError from None
 
 
-def _read_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
+def _decode_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
     """Return the number of a kind at byte `begin` of each message of a table of bytes, (messages,)."""
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]

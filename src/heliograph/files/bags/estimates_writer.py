@@ -107,13 +107,13 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = _load_types()
-    times = _convert_times(record.time, origin)
+    times = _convert_times_to_nanoseconds(record.time, origin)
     # The type of each topic's messages.
     types = {
         topic: kind
         for node, filters in record.estimates.items()
         for name, estimate in filters.items()
-        for topic, kind in _name_topics(_make_prefix(node, name), record.states, estimate.claim, pose)
+        for topic, kind in _yield_topics_and_types(_make_topic_prefix(node, name), record.states, estimate.claim, pose)
     }
     # The writer makes a folder; the file in it is complete in itself.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
@@ -132,7 +132,7 @@ def _load_types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _convert_times(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
+def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     """Return times in nanoseconds since 1970: of dates, or of seconds or steps from an origin (None: 1970)."""
     if time.dtype.kind == "M":
         return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
@@ -145,12 +145,14 @@ def _make_valid_topic_word(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def _make_prefix(node: str, filter_name: str) -> str:
+def _make_topic_prefix(node: str, filter_name: str) -> str:
     """Return the beginning of the topics of one filter at a node, /NODE/FILTER."""
     return f"/{_make_valid_topic_word(node)}/{_make_valid_topic_word(filter_name)}"
 
 
-def _name_topics(prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose) -> Iterator[tuple[str, str]]:
+def _yield_topics_and_types(
+    prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose
+) -> Iterator[tuple[str, str]]:
     """Yield topic and message type of each part of one filter's estimates."""
     if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
@@ -185,7 +187,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
     # Estimates as arrays, once for all rows.
     all_estimates = [
         _FilterEstimates(
-            prefix=_make_prefix(node, name),
+            prefix=_make_topic_prefix(node, name),
             mean=np.asarray(estimate.mean),
             covariance=np.asarray(estimate.covariance),
             claims=np.asarray(estimate.claims),

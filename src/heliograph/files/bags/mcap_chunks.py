@@ -1,4 +1,4 @@
-"""Messages of an indexed MCAP file, a chunk at a time: a quarter of the time of a record at a time."""
+"""Messages of an indexed MCAP file, read a chunk at a time, which takes a quarter of the time of a record at a time."""
 
 import struct
 from bisect import bisect_left

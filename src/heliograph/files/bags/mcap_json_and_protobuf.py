@@ -80,7 +80,7 @@ def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[F
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         try:
-            for count, channel, logged, data, types in _yield_raw_messages(path, file, sources):
+            for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
                 where = f"{path}, message {count}"
                 wanted = sources is None or bool(sources.of(channel.topic))
                 payload = _decode_payload(where, channel, types, data) if wanted else None
@@ -110,7 +110,7 @@ class _StoredMessage(NamedTuple):
     types: dict[int, ProtobufType]
 
 
-def _yield_raw_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
+def _yield_stored_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
 
     Raises:
@@ -151,8 +151,8 @@ def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufT
 
 def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
     """Return the number of a schema of Protocol Buffers with its types; nothing of another, or of one that is none."""
-    name, at = _read_text(content, NUMBER.size)
-    encoding, at = _read_text(content, at)
+    name, at = _read_sized_text(content, NUMBER.size)
+    encoding, at = _read_sized_text(content, at)
     if encoding != PROTOBUF:
         return {}
     try:
@@ -207,7 +207,7 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             yield kind, content
             continue
         _, _, whole, checksum = PART.unpack_from(content)
-        compression, at = _read_text(content, PART.size)
+        compression, at = _read_sized_text(content, PART.size)
         (packed,) = SIZE.unpack_from(content, at)
         data = content[at + SIZE.size : at + SIZE.size + packed]
         yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
@@ -215,14 +215,14 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
     """Return the number of a channel, and its topic, encoding and schema, of which the types are known."""
-    topic, at = _read_text(content, 2 * NUMBER.size)
-    encoding, _ = _read_text(content, at)
+    topic, at = _read_sized_text(content, 2 * NUMBER.size)
+    encoding, _ = _read_sized_text(content, at)
     (schema,) = NUMBER.unpack_from(content, NUMBER.size)
     encoding = BARE if encoding == PROTOBUF and schema not in types else encoding
     return NUMBER.unpack_from(content)[0], McapChannel(topic, encoding, schema)
 
 
-def _read_text(content: bytes, at: int) -> tuple[str, int]:
+def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:
     """Return the text at a place, where its length stands before it, and the place where it ends."""
     (size,) = LENGTH.unpack_from(content, at)
     begin = at + LENGTH.size

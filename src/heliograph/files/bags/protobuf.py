@@ -33,7 +33,7 @@ class ScalarReader(NamedTuple):
 
 
 def _make_fixed_reader(layout: str) -> Callable[[bytes], Any]:
-    """Return what reads a number of fixed length."""
+    """Return a function from the bytes of a number of fixed length to the number; `layout` is a format of `struct`."""
     return lambda data: struct.unpack(layout, data)[0]
 
 
@@ -55,8 +55,8 @@ SCALARS = {  # by type of FieldDescriptorProto
 LENGTHS = {FIXED64: 8, FIXED32: 4}
 
 
-class Field(NamedTuple):
-    """A field of a message.
+class FieldDescriptor(NamedTuple):
+    """A field of a type of Protocol Buffers messages, as the schema describes it.
 
     Args:
         name: as the schema writes it.
@@ -75,14 +75,14 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True)
 class ProtobufSchema:
-    """Types that a file describes.
+    """Message types and enumerations of Protocol Buffers that a file describes, by which messages are decoded.
 
     Args:
         messages: fields of each message by their numbers, by the message's full name.
         enums: names of the values of each enumeration, by its full name.
     """
 
-    messages: dict[str, dict[int, Field]]
+    messages: dict[str, dict[int, FieldDescriptor]]
     enums: dict[str, dict[int, str]]
 
     @staticmethod
@@ -105,12 +105,12 @@ class ProtobufSchema:
             prefix: full name of what it stands in, with a dot.
             implicit: whether an absent field has its default, as in proto3.
         """
-        name, fields = prefix + _read_text_field(data, 1), dict[int, Field]()
+        name, fields = prefix + _read_text_field(data, 1), dict[int, FieldDescriptor]()
         for content in _list_values_of_field(data, 2):
             found = {number: value for number, _, value in read_fields(content)}
             # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
-            fields[int(found[3])] = Field(
+            fields[int(found[3])] = FieldDescriptor(
                 name=_decode_text(found[1]),
                 kind=int(found[5]),
                 of=_decode_text(found.get(6, b"")).removeprefix("."),
@@ -160,7 +160,7 @@ class ProtobufSchema:
                 content[field.name] = values[-1]
         return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
 
-    def _read_value(self, field: Field, value: Any, depth: int) -> Any:
+    def _read_value(self, field: FieldDescriptor, value: Any, depth: int) -> Any:
         """Return a value of a field as JSON has it."""
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
@@ -170,8 +170,8 @@ class ProtobufSchema:
             return _decode_text(value)
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
-    def _choose_default(self, field: Field) -> Any:
-        """Return what an absent field stands for."""
+    def _choose_default(self, field: FieldDescriptor) -> Any:
+        """Return the value of a field that a message leaves out: 0, false, "", a name of an enumeration, or None."""
         if field.kind == ENUM:
             return self.enums.get(field.of, {}).get(0, 0)
         if field.kind in (TEXT, BYTES):
@@ -213,7 +213,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     raise ValueError("no message of Protocol Buffers, or one that was cut off")
 
 
-def _split_packed(field: Field, wire: int, value: Wire) -> list[Wire]:
+def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
     """Return the values of a field as they stand: of a packed list several.
 
     Args:
@@ -242,7 +242,7 @@ def _split_packed(field: Field, wire: int, value: Wire) -> list[Wire]:
     return values
 
 
-def _find_wire_type(field: Field) -> int:
+def _find_wire_type(field: FieldDescriptor) -> int:
     """Return the wire type that stands before a field's value; raise ValueError at a type that is not read."""
     if field.kind in (TEXT, BYTES, MESSAGE):
         return SIZED

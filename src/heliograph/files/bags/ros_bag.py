@@ -82,11 +82,11 @@ def read_bag(
         if not used:
             expected = f"a topic of the sources, {_join_names(sources.topics)}"
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
-        _check_mapped_fields(path, reader, sources)
+        _check_fields_of_sources(path, reader, sources)
         # Messages become events, many at once where all of them can.
         total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
         try:
-            for batch in batch_messages(read_raw_messages(path, reader, used)):
+            for batch in group_into_batches(read_raw_messages(path, reader, used)):
                 if not decoder.append_events(batch, events):
                     _append_messages(path, reader, sources, batch, done, events, strict)
                 done += len(batch)
@@ -185,7 +185,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
         count += 1
 
 
-def batch_messages(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
     """Yield messages in lists of bounded size; an error comes after what was read before it."""
     batch, size, failure = list[RawMessage](), 0, None
     # Up to so many messages or bytes, or to the end.
@@ -265,7 +265,7 @@ def format_moment(nanoseconds: int) -> str:
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
-def _check_mapped_fields(path: Path, reader: "AnyReader", sources: Sources) -> None:
+def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) -> None:
     """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
         fields = dict(list_fields(reader, connection.msgtype))

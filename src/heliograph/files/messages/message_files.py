@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from heliograph.files.sources.message_fields import decode_items, decode_json, fail_of_doubled, parse_number
 from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
-from heliograph.files.text.text_file import find_extension, is_text, open_text, yield_until_cut_off
+from heliograph.files.text.text_file import find_extension, is_valid_text, open_text, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import parse_instant
 
@@ -163,7 +163,7 @@ def decode_document(text: str | bytes, name: str) -> list[FileMessage | InputErr
 def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
     """Return the message of a line, those of a list of them, or why it cannot be read."""
     line = line.strip()
-    if not is_text(line):
+    if not is_valid_text(line):
         return [fail(where, "a text in UTF-8", show_value(line))]
     try:
         return [_convert_item(where, *item) for item in decode_items(line, where)]

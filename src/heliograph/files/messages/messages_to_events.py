@@ -114,8 +114,8 @@ def read_events(
         events = _read_log(source, sources, checked, strict)
     elif isinstance(source, Path) and is_folder(source) and checked is None:
         raise fail("sources", f"a source for the files of {source}", "none")
-    elif _holds_own_rows(source):
-        events = _read_own_table(source, network, strict, ignore_unknown)
+    elif _holds_rows_of_own_format(source):
+        events = _read_table_of_own_format(source, network, strict, ignore_unknown)
     else:
         events = _read_by_topic(source, network, checked, strict)
     if checked is not None:
@@ -141,7 +141,7 @@ def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
     """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic."""
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
-        return named or _holds_own_rows(path)
+        return named or _holds_rows_of_own_format(path)
     if is_bag(path) or is_log(path) or is_folder(path) or holds_events(path) or is_message_file(path):
         return True
     if find_extension(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
@@ -149,7 +149,7 @@ def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
     return make_default_topic(path) in sources or path.name in sources or table_has_topics(path)
 
 
-def _holds_own_rows(source: Path | StoreTable) -> bool:
+def _holds_rows_of_own_format(source: Path | StoreTable) -> bool:
     """Return whether a table has events in our own form: it has the columns `node` and `sequence`."""
     return holds_events(source) if isinstance(source, Path) else {NODE, SEQUENCE} <= source.columns.keys()
 
@@ -161,7 +161,9 @@ def _list_messages(source: Path | StoreTable, sources: Sources | None = None) ->
     return read_message_file(source) if isinstance(source, Path) else source.messages()
 
 
-def _read_own_table(path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool) -> EventTable:
+def _read_table_of_own_format(
+    path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
+) -> EventTable:
     """Return the events of a table in our own form."""
     own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _list_messages(path):

@@ -1,4 +1,4 @@
-"""Messages in our own form, in tables and lines: a node, its count, a time, and values, in any order."""
+"""Messages in the format of heliograph itself, in tables and lines: a node, its count, a time, and values."""
 
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path

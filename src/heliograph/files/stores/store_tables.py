@@ -12,7 +12,7 @@ from heliograph.files.estimates.estimates_table import estimate_columns
 from heliograph.files.messages.message_files import FileMessage, convert_row
 from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
 from heliograph.files.table import TIME, convert_to_columns
-from heliograph.files.table_rows import Rows
+from heliograph.files.table_rows import TableRows
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.process.extras import check_installed
 from heliograph.simulation.results.record import Record
@@ -35,7 +35,7 @@ class StoreTable:
     def __str__(self) -> str:
         return str(self.address)
 
-    def rows(self, only: Mapping[str, str] | None) -> Rows:
+    def rows(self, only: Mapping[str, str] | None) -> TableRows:
         """Return numbers and dates, of the columns among `only`.
 
         Raises:
@@ -43,7 +43,7 @@ class StoreTable:
         """
         columns = convert_to_columns(self.columns, str(self), only)
         count = len(next(iter(self.columns.values()), ()))
-        return Rows(columns, np.arange(1, count + 1), [])
+        return TableRows(columns, np.arange(1, count + 1), [])
 
     def messages(self) -> Iterator[FileMessage]:
         """Yield each row as a message, with dates as text of ISO 8601."""

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from heliograph.files.text.text_file import is_text, open_text
+from heliograph.files.text.text_file import is_valid_text, open_text
 from heliograph.numerics.check import fail, show_value
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
@@ -35,7 +35,7 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
         marked: whether the first of several names may begin with a mark of comments.
     """
     line = ",".join(header)
-    if not is_text(line):
+    if not is_valid_text(line):
         raise fail(
             f"{source}, header", "a text in UTF-8 or UTF-16", f"{show_value(line)}{suggest_recoding(path, line)}"
         )

@@ -8,7 +8,7 @@ from heliograph.numerics.types import Float
 NUMBERS = b"0123456789+-.eE"  # all that such cells are made of
 
 
-def parse_plain_lines(lines: bytes, columns: int) -> Float[np.ndarray, "rows columns"] | None:
+def parse_numeric_lines(lines: bytes, columns: int) -> Float[np.ndarray, "rows columns"] | None:
     """Return the numbers of whole lines, NaN for empty cells; None where anything in them is not plain.
 
     JSON writes numbers as such lines do, and is read in a fifteenth of the time that a row takes with its cells one by

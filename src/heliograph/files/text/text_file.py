@@ -56,7 +56,7 @@ def guess_encoding(start: bytes) -> str:
     return "utf-8-sig"
 
 
-def is_text(line: str) -> bool:
+def is_valid_text(line: str) -> bool:
     """Return whether a line was text, and not bytes that had to be escaped."""
     return (line.isascii() and "\0" not in line) or NO_TEXT.search(line) is None
 
@@ -94,7 +94,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
     total, rest, ended, damage = path.stat().st_size, b"", False, None
     with path.open("rb") as file, _open_unpacked(file) as unpacked:
         try:
-            decode = _choose_decoder(unpacked)
+            decode = _make_decoder_to_utf8(unpacked)
         except DAMAGE as error:
             raise _describe_damage(path, error) from None
         while not ended:
@@ -128,7 +128,7 @@ def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
     return gzip.GzipFile(fileobj=file) if buffered.peek(len(GZIP)).startswith(GZIP) else buffered
 
 
-def _choose_decoder(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
+def _make_decoder_to_utf8(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
     """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8."""
     encoding = guess_encoding(text.peek(len(WIDE[0])))
     if encoding != "utf-8-sig":
