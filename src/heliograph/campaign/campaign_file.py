@@ -171,14 +171,14 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     """
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
-    settings = _expand_grid(table["grid"], name) if "grid" in table else _list_settings(table["settings"], name)
+    settings = _expand_grid(table["grid"], name) if "grid" in table else _read_listed_settings(table["settings"], name)
     # Parameters become coordinates of the store: their names must be free there, their values plain.
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     for i, setting in enumerate(settings):
         for key, value in setting.items():
             if not key.isidentifier() or key in taken:
                 raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
-            _check_value(value, f"{name}, {key} of setting {i}")
+            _check_json_value(value, f"{name}, {key} of setting {i}")
     # Equal settings would have equal random keys, and so equal runs.
     seen: dict[str, int] = {}
     for i, setting in enumerate(settings):
@@ -199,18 +199,18 @@ def _expand_grid(grid: object, name: str) -> list[Setting]:
     return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
 
 
-def _list_settings(settings: object, name: str) -> list[Setting]:
+def _read_listed_settings(settings: object, name: str) -> list[Setting]:
     """Return the tables of [[settings]], at least one."""
     if not isinstance(settings, list) or not settings or not all(isinstance(s, dict) for s in settings):
         raise fail(f"{name}, settings", "tables [[settings]]", repr(settings))
     return settings
 
 
-def _check_value(value: object, name: str) -> None:
+def _check_json_value(value: object, name: str) -> None:
     """Raise ValueError at a value that JSON does not represent without loss; `name`: of the value, for errors."""
     if isinstance(value, dict | list):
         for entry in value.values() if isinstance(value, dict) else value:
-            _check_value(entry, name)
+            _check_json_value(entry, name)
     elif not isinstance(value, str | bool) and not _is_number(value):
         raise fail(name, "finite numbers, strings, booleans, lists or tables", repr(value))
 

@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 
 from heliograph.campaign.definition import BITWISE, Campaign
-from heliograph.campaign.report_page import describe_best_filter, draw_pictures, make_score_table
+from heliograph.campaign.report_page import describe_best_filter, draw_score_pictures, make_score_table
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
 from heliograph.campaign.zarr_store import (
     CLAIM,
@@ -203,7 +203,7 @@ def make_explore_page_html(
         f"{campaign.horizon} steps; {_describe_shown_part(settings, campaign, shown, scores)} "
         "A case is a node in a setting.",
         sections=[
-            Section("Results", draw_pictures(campaign, scores), STATIC),
+            Section("Results", draw_score_pictures(campaign, scores), STATIC),
             Section("All scores", [make_score_table(campaign, scores)], STATIC),
             Section("What the columns say", [Points(MEANING)]),
         ],

@@ -192,7 +192,7 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
             f"scheduler {address}", "the address of a Dask scheduler that answers", _format_error(error)
         ) from None
     try:
-        yield lambda jobs: _submit_jobs(client, campaign, str(store), deque(jobs), timeout)
+        yield lambda jobs: _run_jobs_on_cluster(client, campaign, str(store), deque(jobs), timeout)
     finally:
         _close_client(client)
 
@@ -203,7 +203,7 @@ def _close_client(client: Untyped) -> None:
         client.close(timeout=CONNECT)
 
 
-def _submit_jobs(
+def _run_jobs_on_cluster(
     client: Untyped, campaign: str, store: str, waiting: deque[Job], timeout: float
 ) -> Iterator[tuple[Job, Reply]]:
     """Run jobs on a Dask cluster, a few more at once than it has threads; yield each with its reply, as they end.

@@ -29,7 +29,7 @@ TITLE = 26  # characters in a line above a panel
 LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 
 
-def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
+def write_campaign_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
     """Write the report next to the store; return its path."""
     path = out / REPORT
     path.write_text(make_campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
@@ -49,7 +49,7 @@ def make_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Se
         "is a node in a setting.",
         sections=[
             *([_list_failures(failures)] if failures else []),
-            Section("Results", draw_pictures(campaign, scores)),
+            Section("Results", draw_score_pictures(campaign, scores)),
             Section("All scores", [make_score_table(campaign, scores)]),
             _explain_opening_in_python(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
@@ -93,7 +93,7 @@ def _list_failures(failures: Sequence[FailedJob]) -> Section:
     return Section("What failed", [Points(points), Text([text]), Code(failures[0].command)])
 
 
-def draw_pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
+def draw_score_pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
     """Return the figures of a campaign's scores as pictures, the first with a caption for all."""
     caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
     return [
@@ -181,12 +181,12 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
             curve = [score for score in of_panel if score.filter == name]
             curve.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in curve]
-            y, error = _list_values(curve, quantity)
+            y, error = _list_scores_and_errors(curve, quantity)
             label = quote_for_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(quote_for_figure(title), TITLE))
     drawn = [score for of_panel in shown.values() for score in of_panel]
-    _choose_scale(grid[0], [values[score.setting] for score in drawn], "x")
+    _choose_axis_scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(quote_for_figure(parameter), fontsize=10, color=INK)
     _finish_figure(figure, grid, drawn, quantity, colours)
     return figure
@@ -214,7 +214,7 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Score
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(shifts, colours, strict=True):
             points = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
-            x, error = _list_values(points, quantity)
+            x, error = _list_scores_and_errors(points, quantity)
             heights = [settings.index(score.setting) + shift for score in points]
             label = quote_for_figure(name)
             axes.errorbar(x, heights, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=label)
@@ -225,7 +225,7 @@ def plot_by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Score
             axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=DASHED)
     # One scale for all panels, and one legend.
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
-    _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
+    _choose_axis_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
     grid[-1].set_xlabel(quantity.label)
     _draw_legend(figure, grid, colours)
     return figure
@@ -254,7 +254,7 @@ def _assign_colours(scores: Sequence[Score]) -> dict[str, str]:
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
-def _list_values(scores: Sequence[Score], quantity: ScoreColumn) -> tuple[np.ndarray, np.ndarray]:
+def _list_scores_and_errors(scores: Sequence[Score], quantity: ScoreColumn) -> tuple[np.ndarray, np.ndarray]:
     """Return a quantity of each score and its standard error (scores,), 0 where that is not known."""
     values = np.array([getattr(score, quantity.value) for score in scores])
     return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
@@ -267,12 +267,12 @@ def _finish_figure(
     if quantity is NEES:
         for axes in grid:
             axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=DASHED)
-    _choose_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
+    _choose_axis_scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
     figure.supylabel(quantity.label, fontsize=10, color=INK)
     _draw_legend(figure, grid, colours)
 
 
-def _choose_scale(axes: Axes, values: Sequence[float], axis: str) -> None:
+def _choose_axis_scale(axes: Axes, values: Sequence[float], axis: str) -> None:
     """Make a shared axis logarithmic if its values span a large ratio."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():

@@ -50,7 +50,9 @@ def sweep(
         ValueError: as `load_campaign` and `run_campaign`; a chunk without its setting.
         ModuleNotFoundError: an extra of `sweep`, `report`, `cluster` is not installed.
     """
-    from heliograph.campaign.report_page import write_report  # a missing extra is reported before the work starts
+    from heliograph.campaign.report_page import (
+        write_campaign_report,  # a missing extra is reported before the work starts
+    )
 
     campaign = load_campaign(path)
     only = _select_chunks(campaign, setting, chunk)
@@ -60,7 +62,7 @@ def sweep(
     with show_campaign_progress(workers or os.cpu_count() or 1) as progress:
         outcome = run_campaign(campaign, out, workers, scheduler, only, progress)
     scores = read_summary(out / SUMMARY)
-    report = write_report(campaign, scores, out)
+    report = write_campaign_report(campaign, scores, out)
     print_scores(campaign, scores)
     console = rich.console.Console()
     console.print(_count_chunks(outcome), soft_wrap=True, highlight=False, markup=False)

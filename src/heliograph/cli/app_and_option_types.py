@@ -20,7 +20,7 @@ app = App(
 )
 
 
-def number(text: str) -> Parameter:
+def integer_option(text: str) -> Parameter:
     """Declare an option that is an integer."""
     return Parameter(help=text, converter=_convert_to_int)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app_and_option_types import choose_results_folder, measured_option, number, path_option
+from heliograph.cli.app_and_option_types import choose_results_folder, integer_option, measured_option, path_option
 from heliograph.cli.measured_data import ReadingOptions, read_measured_plants
 from heliograph.files.stores.store_address import StoreAddress
 
@@ -32,7 +32,10 @@ def backtest(
     horizons: Annotated[str, Parameter(help="Rows ahead, as 1,3,12.")] = "1,2,5,10",
     skip: Annotated[int, Parameter(help="Rows at the start from which nothing is forecast.")] = 10,
     refit: Annotated[
-        int, number("Rows between fits of the free numbers to the rows before; 0: the numbers of the file throughout.")
+        int,
+        integer_option(
+            "Rows between fits of the free numbers to the rows before; 0: the numbers of the file throughout."
+        ),
     ] = 0,
     reading: ReadingOptions | None = None,
 ) -> None:

@@ -55,9 +55,9 @@ def check(
     # What is asked of sensors is computed first, so that bad input prints nothing.
     loaded, module = load_module(network)
     options = WorthOptions(without or [], outage or [], added or [], inputs or [], steps, runs, figure)
-    if figure is not None and not options.asked:
+    if figure is not None and not options.is_asked:
         raise fail("--figure", "what sensors are worth (--without, --outage or --with)", "none of these")
-    worth = compute_worth(loaded, module, options) if options.asked else None
+    worth = compute_worth(loaded, module, options) if options.is_asked else None
     # The diagram, then a line for each doubt, of which only the serious ones count.
     print("\n".join(map(visible, loaded.diagram().splitlines())))
     doubts = doubts_before_data(loaded)

@@ -38,7 +38,7 @@ def export(
         holds several. The name may be that of a function that returns one.
     """
     from heliograph.disk.quoted_text import visible
-    from heliograph.export.c_files import PRECISIONS, check_source_path, measure_cost, write_filter
+    from heliograph.export.c_files import PRECISIONS, check_source_path, measure_step_cost, write_filter_files
     from heliograph.export.c_text import find_claim_at_precision
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
@@ -47,9 +47,9 @@ def export(
     check_source_path(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
-    written = write_filter(named.filter, named.received, out, precision, apart, size, window)
+    written = write_filter_files(named.filter, named.received, out, precision, apart, size, window)
     exported, real = named.filter, PRECISIONS[precision]
-    measured = measure_cost(written.header, written.source, exported.received, len(exported.inputs), real)
+    measured = measure_step_cost(written.header, written.source, exported.received, len(exported.inputs), real)
     claim = find_claim_at_precision(exported, real)
     print(visible(f"{written.header}, {written.source}: {named.place}/{filter} ({claim}), {precision} precision"))
     print("\n".join(describe_costs(written, measured)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app_and_option_types import measured_option, number, path_option
+from heliograph.cli.app_and_option_types import integer_option, measured_option, path_option
 from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants, take_only_plant
 from heliograph.cli.stop_signals import GentleStop
 from heliograph.files.stores.store_address import StoreAddress
@@ -36,8 +36,8 @@ def fit(
     *,
     measurements: Annotated[Path | StoreAddress, measured_option()],
     out: Annotated[Path, path_option("Folder of fitted.json, fitted_network.py, figures and page; made if missing.")],
-    starts: Annotated[int, number("From how many points to climb.")] = 6,
-    seed: Annotated[int, number("Seed of the starts.")] = 0,
+    starts: Annotated[int, integer_option("From how many points to climb.")] = 6,
+    seed: Annotated[int, integer_option("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
     truth: Annotated[bool, Parameter(help="Learn from the true states (columns truth.STATE).", negative="")] = False,
     reading: ReadingOptions | None = None,
@@ -271,7 +271,7 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
             "best": loss.best,
             "memory_p": loss.memory.likelihood_p,
             "laws": {
-                name_of_law: {key: _convert_share(share) for key, share in law.shares().items()}
+                name_of_law: {key: _convert_share_to_json(share) for key, share in law.shares().items()}
                 for name_of_law, law in loss.laws.items()
             },
             "gains": {name_of_law: score.gain for name_of_law, score in loss.held_out.items()},
@@ -281,6 +281,6 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
     return {"filters": filters, "losses": losses}
 
 
-def _convert_share(share: "Share") -> "dict[str, Json]":
+def _convert_share_to_json(share: "Share") -> "dict[str, Json]":
     """Return a share and its interval by name; None if nothing was counted."""
     return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from heliograph.files.topic_inspection import Topic
+    from heliograph.files.topic_inspection import TopicStatistics
 
 
 def inspect(
@@ -48,10 +48,10 @@ def inspect(
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 
 
-def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
+def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, TopicStatistics], str]":
     """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
     from heliograph.files.logs.vehicle_log import is_log
-    from heliograph.files.messages.folder_of_message_files import is_folder
+    from heliograph.files.messages.folder_of_message_files import is_message_folder
     from heliograph.files.messages.message_files import LINES
     from heliograph.files.text.text_file import find_extension
     from heliograph.files.topic_inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
@@ -71,13 +71,13 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
         if is_log(path):
             advance(f"reading {recording}")
             return inspect_log(path, dbc)
-        if is_folder(path):
+        if is_message_folder(path):
             advance(f"reading {recording}")
             return inspect_folder(path)
         return inspect_bag(path, lambda done, total: advance(f"reading {recording}", done, total))
 
 
-def _print_table(topics: "dict[str, Topic]") -> None:
+def _print_table(topics: "dict[str, TopicStatistics]") -> None:
     """Print a line for each topic: its messages, their rate and largest gap, and how late they come."""
     import rich.console
     import rich.markup

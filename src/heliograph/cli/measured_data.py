@@ -40,7 +40,7 @@ class ReadingOptions:
     ] = False
 
     @property
-    def of_messages(self) -> bool:
+    def are_for_messages(self) -> bool:
         """Return whether an option is given that rows of time have not."""
         return self.window is not None or self.ahead is not None or self.plant is not None
 
@@ -101,7 +101,7 @@ def read_measured_plants(
     path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
-        if options.of_messages:
+        if options.are_for_messages:
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
@@ -146,7 +146,7 @@ def read_events(
     """Read the messages of a bag, a file or a store; None for rows of time."""
     from heliograph.files.bags.ros_bag import is_bag
     from heliograph.files.logs.vehicle_log import is_log
-    from heliograph.files.messages.folder_of_message_files import is_folder
+    from heliograph.files.messages.folder_of_message_files import is_message_folder
     from heliograph.files.messages.messages_to_events import is_of_messages
     from heliograph.files.messages.messages_to_events import read_events as read_mapped
     from heliograph.numerics.check import fail
@@ -154,7 +154,7 @@ def read_events(
     sources = module.get("sources")
     if not is_of_messages(path, sources):
         return None
-    if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path) or is_folder(path)):
+    if sources is None and isinstance(path, Path) and (is_bag(path) or is_log(path) or is_message_folder(path)):
         hint = f"heliograph inspect {path} --network {reference} suggests them"
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app_and_option_types import measured_option, number, path_option
+from heliograph.cli.app_and_option_types import integer_option, measured_option, path_option
 from heliograph.cli.measured_data import ReadingOptions, open_path_or_store, read_events, read_rows
 from heliograph.files.stores.store_address import StoreAddress
 
@@ -38,7 +38,7 @@ def replay(
     delay: Annotated[float, Parameter(help="Mean time on the way, of an exponential law: messages overtake.")] = 0.0,
     duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
     trace: Annotated[Path | None, path_option("CSV of a recorded link, one delay a message, nan if lost.")] = None,
-    seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
+    seed: Annotated[int, integer_option("Seed of what happens on the way.")] = 0,
     strict: Annotated[
         bool, Parameter(help="Stop at the first message or row that cannot be read.", negative="")
     ] = False,

@@ -231,11 +231,15 @@ def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
     """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
-    from heliograph.files.messages.folder_of_message_files import is_folder, list_used_files
+    from heliograph.files.messages.folder_of_message_files import is_message_folder, list_used_files
     from heliograph.files.sources.sources import Sources
     from heliograph.numerics.check import fail
 
-    if sources is None or not isinstance(out, Path) or not (isinstance(measurements, Path) and is_folder(measurements)):
+    if (
+        sources is None
+        or not isinstance(out, Path)
+        or not (isinstance(measurements, Path) and is_message_folder(measurements))
+    ):
         return
     if out.resolve() in [file.resolve() for file in list_used_files(measurements, Sources(sources, network))]:
         raise fail(f"output file {out}", "another file than the measurements", "one of them")

@@ -62,7 +62,7 @@ def run_in_blocks(
     """
     from heliograph.files.messages.messages_to_events import is_of_messages
 
-    if not isinstance(measurements, Path) or options.of_messages or not is_long(measurements):
+    if not isinstance(measurements, Path) or options.are_for_messages or not is_long(measurements):
         return None
     if is_of_messages(measurements, module.get("sources")):
         return None

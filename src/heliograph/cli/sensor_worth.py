@@ -39,7 +39,7 @@ class WorthOptions:
     figure: Path | None
 
     @property
-    def asked(self) -> bool:
+    def is_asked(self) -> bool:
         """Return whether anything is asked."""
         return bool(self.without or self.outage or self.added)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import rich.console
 from cyclopts import Parameter
 
-from heliograph.cli.app_and_option_types import number, path_option
+from heliograph.cli.app_and_option_types import integer_option, path_option
 
 
 def sweep(
@@ -14,10 +14,10 @@ def sweep(
     /,
     *,
     out: Annotated[Path, path_option("Folder for the results; what is already there is not computed again.")],
-    workers: Annotated[int | None, number("Processes here; 0: this one; by default one a CPU.")] = None,
+    workers: Annotated[int | None, integer_option("Processes here; 0: this one; by default one a CPU.")] = None,
     scheduler: Annotated[str | None, Parameter(help="Address of a Dask scheduler to work on instead.")] = None,
-    setting: Annotated[int | None, number("Run only this setting, here in one process.")] = None,
-    chunk: Annotated[int | None, number("And of it only this chunk.")] = None,
+    setting: Annotated[int | None, integer_option("Run only this setting, here in one process.")] = None,
+    chunk: Annotated[int | None, integer_option("And of it only this chunk.")] = None,
 ) -> int:
     """Simulate a network in many settings, into one labelled store that survives any interruption.
 

@@ -13,7 +13,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 
 from heliograph.disk.atomic_files import check_writable, whole_files
 from heliograph.export.c_text import CText, CTextOptions, generate_header_and_source
-from heliograph.export.late_measurement_window import check_window
+from heliograph.export.late_measurement_window import check_and_count_window_steps
 from heliograph.export.step_program import RESERVED, Real, lower_step_to_c_functions
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled import ScheduledFilter
@@ -87,12 +87,12 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
+        return write_filter_files(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
+    return write_filter_files(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
     return outputs if len(outputs) == filter.received else tuple(f"z{i}" for i in range(filter.received))
 
 
-def write_filter(
+def write_filter_files(
     filter: AbstractFilter,
     received: Sequence[str],
     path: str | Path,
@@ -114,7 +114,7 @@ def write_filter(
     source = check_source_path(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    late = None if window is None else check_window(filter, window)
+    late = None if window is None else check_and_count_window_steps(filter, window)
     text = make_c_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
@@ -163,7 +163,7 @@ def make_c_text(
     Raises:
         ValueError: single precision for a filter that cannot keep its covariance in it; a number that is beyond it.
     """
-    if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
+    if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_covariance_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     exported = filter if real == "double" else filter.for_single_precision()
@@ -183,7 +183,7 @@ def make_c_text(
     return min(texts, key=lambda text: len(text.source))
 
 
-def carries_factors(filter: AbstractFilter) -> bool:
+def carries_covariance_factors(filter: AbstractFilter) -> bool:
     """Return whether the state has variances of L D L', which stay positive in any precision, and no covariance."""
     return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
 
@@ -195,7 +195,7 @@ class StepCost(NamedTuple):
     nanoseconds: float | None
 
 
-def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
+def measure_step_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
     """Return the bytes of code and the time of a step, compiled in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:

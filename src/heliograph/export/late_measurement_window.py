@@ -48,7 +48,7 @@ class LateMeasurementWindow(NamedTuple):
         return self.rows + (self.time is not None)
 
 
-def check_window(filter: AbstractFilter, steps: object) -> int:
+def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
     """Return how many steps late a measurement may be, checked: a filter in continuous time can make rows in between.
 
     Warns where a plant's prediction over an interval is not that over its parts.

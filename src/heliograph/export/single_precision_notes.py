@@ -17,7 +17,7 @@ HALF_UNIT = 2.0**-24  # by which single precision rounds, of the number
 
 def explain_ranges(filter: AbstractFilter) -> list[str]:
     """Return a note for each component of z, up to which size its rounding is small beside its noise; "" if unknown."""
-    deviations = _find_deviations(filter)
+    deviations = _find_noise_deviations(filter)
     if deviations is None:
         return [""] * filter.received
     return [f" (up to {_round_down(SHARE * x / HALF_UNIT):g}, see below)" if x > 0 else "" for x in deviations]
@@ -36,7 +36,7 @@ def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
     return [*(lines if ranged else []), *(apart if isinstance(filter.init(), SplitMeanGaussian) else [])]
 
 
-def _find_deviations(filter: AbstractFilter) -> np.ndarray | None:
+def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:
     """Return the standard deviation of the noise of each component of z (received,); None of a filter that has none.
 
     The noise of z is M v + n: the sensor's noise v times the link's mean gain M, and the link's own noise n. A filter

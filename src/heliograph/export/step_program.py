@@ -84,7 +84,7 @@ def lower_step_to_c_functions(
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
-    read, of_estimate = _make_members(state, filter.estimate(state))
+    read, of_estimate = _make_state_members(state, filter.estimate(state))
     candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
     try:
         symmetric = _find_symmetric_arrays(parts)
@@ -121,7 +121,7 @@ def lower_step_to_c_functions(
     )
 
 
-def _make_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMember], list[StateMember]]:
+def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMember], list[StateMember]]:
     """Return members of the state in C: the arrays of the filter's state, and the estimate's mean and covariance."""
     named_arrays = zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
     of_state = [StateMember(name, np.asarray(array)) for name, array in named_arrays]

@@ -146,7 +146,7 @@ class CsvColumnReader:
                 continue
             has_dates = self._dated.get(name)  # None: not decided yet
             if (looks_like_date(cell) if has_dates is None else has_dates) and not self._is_missing(cell):
-                numbers.append(self._read_moment(row, name, cell))
+                numbers.append(self._parse_date(row, name, cell))
                 newly_dated[name] = True
             elif has_dates:
                 numbers.append(NAT)
@@ -162,7 +162,7 @@ class CsvColumnReader:
         """Return whether a cell is empty, or says that there is no value."""
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
-    def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
+    def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
         """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)

@@ -178,9 +178,9 @@ class RowReader:
             ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
                 reading is strict. One line that names the row, from 1, and the column.
         """
-        return self.arrange(self.read_cells(rows))
+        return self.arrange_recording(self.read_cells(rows))
 
-    def arrange(self, cells: RecordingRows) -> Recording:
+    def arrange_recording(self, cells: RecordingRows) -> Recording:
         """Return rows as a recording; unless reading is strict, in the order of their times.
 
         Raises:

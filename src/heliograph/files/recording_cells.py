@@ -66,7 +66,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
         *(names for components in received.values() for names in components),
         *((name,) for name in truth_columns.values()),
     ]
-    _refuse_unknown(columns, expected, source)
+    _refuse_unknown_columns(columns, expected, source)
     time = _read_times(columns, _find_column(columns, (TIME,), source), refusals)
     measurements = {}
     for node, components in received.items():
@@ -107,7 +107,7 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     return {node: [list_allowed(node, name) for name in components] for node, components in names.items()}
 
 
-def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
+def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
     """Raise one line with the closest known name if a column belongs to nothing of the network."""
     known = [name for names in expected for name in names]
     for column in columns:

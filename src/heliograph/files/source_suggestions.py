@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph.files.topic_inspection import Topic
+from heliograph.files.topic_inspection import TopicStatistics
 
 DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
 FEW = 6  # fields that a suggestion lists
 
 
-def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
+def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, Sequence[str]]) -> str:
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
     Args:
@@ -34,7 +34,7 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
     return "\n".join([*lines, "}"])
 
 
-def _suggest_options(topic: Topic, dated: bool) -> str:
+def _suggest_options(topic: TopicStatistics, dated: bool) -> str:
     """Return a source's options for a topic's time and count; `dated`: whether there are dates in any topic."""
     options = ""
     if topic.time is not None:
@@ -46,17 +46,17 @@ def _suggest_options(topic: Topic, dated: bool) -> str:
     return options
 
 
-def _write_time_option(topic: Topic, dated: bool) -> str:
+def _write_time_option(topic: TopicStatistics, dated: bool) -> str:
     """Return a time as a source has it: beside dates a clock that counts from its own start has the date of that."""
     return f"hg.files.Stamp({topic.time!r}, start='DATE')" if topic.own_clock and dated else repr(topic.time)
 
 
-def _write_count_option(topic: Topic, path: str) -> str:
+def _write_count_option(topic: TopicStatistics, path: str) -> str:
     """Return a running count as a source has it: with its bits, where the file says them."""
     return f"hg.files.Count({path!r}, bits={topic.bits[path]})" if path in topic.bits else repr(path)
 
 
-def _comment_on_unit(topic: Topic, path: str, mark: str = "  #") -> str:
+def _comment_on_unit(topic: TopicStatistics, path: str, mark: str = "  #") -> str:
     """Return the unit of a field as a comment, "" if the file names none; of degrees, what makes them radians."""
     if path not in topic.measured_in:
         return ""

@@ -62,11 +62,11 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     if column.dtype.kind in "fiub":
         return convert_to_numbers(column)
     if column.dtype.kind in "OUT":
-        return _convert_objects(column, name)
+        return _convert_object_column(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
 
 
-def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
+def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
     """Return a column of objects as numbers, NaN for None, or as dates; the first value says which.
 
     Text is no number, though it may read as one.

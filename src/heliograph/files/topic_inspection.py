@@ -16,9 +16,9 @@ from heliograph.files.bags.mcap_json_and_protobuf import holds_messages, read_mc
 from heliograph.files.bags.ros_bag import OFTEN, Progress, list_fields, open_bag, parts_of
 from heliograph.files.logs.log_reading import open_logs
 from heliograph.files.logs.log_sources import LogSources
-from heliograph.files.messages.folder_of_message_files import list_files
+from heliograph.files.messages.folder_of_message_files import list_message_files
 from heliograph.files.messages.message_files import (
-    decode_payload,
+    decode_message_content,
     is_message_file,
     make_default_topic,
     read_message_file,
@@ -55,7 +55,7 @@ CLOCKS = re.compile(
 
 
 @dataclass
-class Topic:
+class TopicStatistics:
     """What messages of one topic have: their number, fields, times of logging or arrival, dates, and lateness.
 
     Attributes:
@@ -134,20 +134,20 @@ class Topic:
         return [self.kind, count, rate, gap, " ".join(f"{value:.3g}" for value in quantiles) or "-"]
 
 
-def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, Topic], str]:
+def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str, TopicStatistics], str]:
     """Return the topics of a bag or of the bags in a folder, and where and why reading one ended early, "" if none did.
 
     Raises:
         ValueError: no bag, or one that cannot be opened.
     """
-    topics, broken = dict[str, Topic](), ""
+    topics, broken = dict[str, TopicStatistics](), ""
     for part in parts_of(path) or [path]:
         ended = _inspect_mcap(part, topics) if holds_messages(part) else _inspect_one_bag(part, topics, progress)
         broken = broken or ended
     return topics, broken
 
 
-def _inspect_one_bag(path: Path, topics: dict[str, Topic], progress: Progress | None) -> str:
+def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: Progress | None) -> str:
     """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not.
 
     Args:
@@ -173,15 +173,15 @@ def _inspect_one_bag(path: Path, topics: dict[str, Topic], progress: Progress | 
         return cut_off
 
 
-def _describe_type(reader: "AnyReader", kind: str) -> Topic:
+def _describe_type(reader: "AnyReader", kind: str) -> TopicStatistics:
     """Return a topic of messages of a type of ROS: its fields of numbers, and its stamp, which only ROS 2 has first."""
     fields = list(list_fields(reader, kind))
     numbers = [name for name, basic in fields if basic not in NO_NUMBERS and not name.startswith("header.")]
     has_stamp = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
-    return Topic(kind, numbers, STAMP if has_stamp else None)
+    return TopicStatistics(kind, numbers, STAMP if has_stamp else None)
 
 
-def _inspect_mcap(path: Path, topics: dict[str, Topic]) -> str:
+def _inspect_mcap(path: Path, topics: dict[str, TopicStatistics]) -> str:
     """Add the topics of an MCAP file without ROS, and return where and why reading it ended early."""
     for message in read_mcap_messages(path):
         if isinstance(message, InputError):
@@ -194,7 +194,7 @@ def _inspect_mcap(path: Path, topics: dict[str, Topic]) -> str:
     return ""
 
 
-def note_payload(topics: dict[str, Topic], name: str, payload: str | bytes, arrival: int) -> None:
+def note_payload(topics: dict[str, TopicStatistics], name: str, payload: str | bytes, arrival: int) -> None:
     """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
     try:
         _note_message(topics, name, decode_json(payload, name), "JSON", arrival)
@@ -202,7 +202,9 @@ def note_payload(topics: dict[str, Topic], name: str, payload: str | bytes, arri
         _note_message(topics, name, None, "no JSON", arrival)
 
 
-def _note_message(topics: dict[str, Topic], name: str, content: object, kind: str, arrival: int | None) -> None:
+def _note_message(
+    topics: dict[str, TopicStatistics], name: str, content: object, kind: str, arrival: int | None
+) -> None:
     """Count a message under its topic; note its fields of numbers, and its dates with how late it came.
 
     Args:
@@ -212,7 +214,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
         kind: type of the message, of a new topic.
         arrival: in nanoseconds since 1970; None where it is not known.
     """
-    topic = topics.setdefault(name, Topic(kind))
+    topic = topics.setdefault(name, TopicStatistics(kind))
     topic.messages += 1
     if arrival is not None:
         topic.logged.append(arrival)
@@ -224,7 +226,7 @@ def _note_message(topics: dict[str, Topic], name: str, content: object, kind: st
         _note_date(topic, path, value, arrival)
 
 
-def _note_date(topic: Topic, path: str, value: object, arrival: int | None) -> None:
+def _note_date(topic: TopicStatistics, path: str, value: object, arrival: int | None) -> None:
     """Note a value as a date of its field, which may be the time of measurement, if it is one: a stamp, text or number.
 
     `arrival`: of its message, in nanoseconds since 1970; None where it is not known.
@@ -267,13 +269,13 @@ def _find_unit_of_date(value: object) -> TimeUnit | None:
     return next((unit for unit, size in UNITS.items() if YEARS.start <= value * size / SECOND < YEARS.stop), None)
 
 
-def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
+def inspect_file(path: Path) -> tuple[dict[str, TopicStatistics], str]:
     """Return the topics of a file of messages, and the first reason why one cannot be read, "" if all can be.
 
     Raises:
         ValueError: no such file, or one that cannot be read at all.
     """
-    topics, broken = dict[str, Topic](), ""
+    topics, broken = dict[str, TopicStatistics](), ""
     for message in read_message_file(path):
         if isinstance(message, InputError):
             broken = broken or str(message)
@@ -286,27 +288,29 @@ def inspect_file(path: Path) -> tuple[dict[str, Topic], str]:
             note_payload(topics, name, message.content, arrival)
             continue
         try:
-            _note_message(topics, name, decode_payload(message), "JSON" if is_message_file(path) else "row", arrival)
+            _note_message(
+                topics, name, decode_message_content(message), "JSON" if is_message_file(path) else "row", arrival
+            )
         except InputError:
             _note_message(topics, name, None, "no JSON", arrival)
     return topics, broken
 
 
-def inspect_folder(path: Path) -> tuple[dict[str, Topic], str]:
+def inspect_folder(path: Path) -> tuple[dict[str, TopicStatistics], str]:
     """Return the topics of the files of messages in a folder, and the first reason why a message cannot be read.
 
     Raises:
         ValueError: no file of messages in it, or one that cannot be read at all.
     """
-    topics, broken = dict[str, Topic](), ""
-    for file in list_files(path):
+    topics, broken = dict[str, TopicStatistics](), ""
+    for file in list_message_files(path):
         found, reason = inspect_file(file)
         topics |= found
         broken = broken or reason
     return topics, broken
 
 
-def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
+def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics], str]:
     """Return the messages of a vehicle's log, and the first reason why some cannot be read, "" if all can be.
 
     Args:
@@ -317,7 +321,7 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
         ValueError: no such file, one that cannot be opened, a database that does not fit; one line.
     """
     log = open_logs(path, LogSources({}, dbc=dbc), lambda name: True)
-    topics, broken = dict[str, Topic](), ""
+    topics, broken = dict[str, TopicStatistics](), ""
     for message in log.messages:
         if isinstance(message, InputError):
             broken = broken or str(message)
@@ -327,7 +331,7 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, Topic], str]:
             units = log.units.get(name, {})
             known = {signal: unit for signal, unit in units.items() if unit}
             kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
-            topics[name] = Topic(kind, list(units), measured_in=known, bits=bits)
+            topics[name] = TopicStatistics(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
     if topics and not log.units:
         broken = broken or str(fail(str(path), "the database of its frames, to list signals (--dbc car.dbc)", "none"))

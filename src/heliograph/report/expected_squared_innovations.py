@@ -25,7 +25,9 @@ def compute_expected_squares(
     return np.where(over_runs > 0, in_run / np.where(over_runs > 0, over_runs, 1.0), 1.0)
 
 
-def compare_squares(squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]) -> tuple[float, float]:
+def compute_ratio_of_squares(
+    squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]
+) -> tuple[float, float]:
     """Return the ratio of the squares' mean to that expected of them, 1 where a claim holds, and its standard error.
 
     Args:
@@ -52,5 +54,5 @@ def scale_size_to_expected(
     there = ~np.isnan(white)
     count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
     squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
-    power, error = compare_squares(np.where(there.any(axis=1), squares, np.nan), means)
+    power, error = compute_ratio_of_squares(np.where(there.any(axis=1), squares, np.nan), means)
     return replace(test, power=power, power_error=error)

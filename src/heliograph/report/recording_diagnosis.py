@@ -219,7 +219,7 @@ class Health:
             numbers = int(np.count_nonzero(~np.isnan(column)))
             if numbers and judge_size(*average_correlated(column), numbers, level):
                 return False
-        test = _test_innovations(off.white)
+        test = _test_memory(off.white)
         return test is None or not self._has_memory(health, test)
 
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
@@ -314,7 +314,7 @@ def _examine_filter(
     white, test, expected = None, None, np.ones(1)  # of the squares: 1 is what a claim that holds gives
     if filter.claim != "none" and filter.received:
         white = np.asarray(score_innovations(filter, z, inputs)[1])
-        test = _test_innovations(subtract_mean(white) if weighs(filter) else white)
+        test = _test_memory(subtract_mean(white) if weighs(filter) else white)
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
     lost_claim = np.any(record.estimates[node][name].claims == "none")  # in some row
@@ -386,7 +386,7 @@ def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "ste
     return np.asarray(white - np.nansum(white, axis=0) / count)
 
 
-def _test_innovations(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
+def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     """Test the innovations of one filter, from each message to the next; None of too few, or of nothing but zeros."""
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)

@@ -18,7 +18,7 @@ from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.numerics.counted_shares import average_correlated
 from heliograph.numerics.counted_shares import round_to as round_to
-from heliograph.report.expected_squared_innovations import compare_squares, compute_expected_squares
+from heliograph.report.expected_squared_innovations import compute_expected_squares, compute_ratio_of_squares
 from heliograph.report.innovation_medians import compute_innovation_medians
 from heliograph.report.results_folder import Json
 from heliograph.report.stuck_sensors import NO_LAW, NoiseLaw, StuckValue, find_stuck_value, list_noise_laws
@@ -261,7 +261,7 @@ def judge_outputs(
     squares, variance = innovations.square_used(), np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
-        size, size_error = compare_squares(squares[:, i], expected[:, i])
+        size, size_error = compute_ratio_of_squares(squares[:, i], expected[:, i])
         judged.append(
             OutputJudgement(
                 output=name,

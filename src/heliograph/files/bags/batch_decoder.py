@@ -58,7 +58,7 @@ class MessageLayout:
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
-        self._read_length(0)
+        self._note_length(0)
         end = self._locate_message_numbers(4, kind, "")
         if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
             raise LayoutNotFixedError  # a message is filled up to four bytes at most
@@ -102,13 +102,13 @@ class MessageLayout:
             return self._locate_message_numbers(begin, of, f"{path}.")
         if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
             begin = _align_to_size(begin, 4)
-            return begin + 4 + self._read_length(begin)
+            return begin + 4 + self._note_length(begin)
         if node == "BASE":
             return self._locate_numbers_in_row(begin, of[0], 1, [path])
         (item_node, item_of), count = of
         if node == "SEQUENCE":  # the length that it has in this message stands before its items
             begin = _align_to_size(begin, 4)
-            count, begin = self._read_length(begin), begin + 4
+            count, begin = self._note_length(begin), begin + 4
         if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
             is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
             names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
@@ -128,7 +128,7 @@ class MessageLayout:
                 self.fields[name] = begin + i * size, kind
         return begin + count * size
 
-    def _read_length(self, begin: int) -> int:
+    def _note_length(self, begin: int) -> int:
         """Return the length that stands at this byte, and note it: messages of the layout all have it there."""
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
@@ -191,10 +191,10 @@ class BatchDecoder:
             table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
             for rows, columns in self._yield_rows_by_layout(batch[numbers[0]].connection, table):
                 for source, _, places in self._sources.of(topic):
-                    # The node and the places of its values, of which there is one: `_list_paths` refuses others.
+                    # The node, and the places of its values: one, as `_list_paths_of_numbers` refuses others.
                     ((node, outputs),) = places.items()
                     size = len(self._sources.names[node])
-                    results[node].append(_convert_columns(np.array(numbers)[rows], columns, source, outputs, size))
+                    results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
         return results
 
     def _yield_rows_by_layout(
@@ -211,7 +211,9 @@ class BatchDecoder:
         # One known layout after another; where none is left, a new one by the first message that has none.
         while len(left):
             if index == len(known):
-                paths = {path for source, *_ in self._sources.of(connection.topic) for path in _list_paths(source)}
+                paths = {
+                    path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
+                }
                 known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
             yield left[fits], known[index].read_columns(table[left[fits]])
@@ -231,7 +233,7 @@ class NodeReadings(NamedTuple):
     period: int
 
 
-def _list_paths(source: Source) -> list[str]:
+def _list_paths_of_numbers(source: Source) -> list[str]:
     """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutNotFixedError
@@ -245,7 +247,7 @@ def _list_component_paths(path: str | Computed) -> tuple[str, ...]:
     return (path,) if isinstance(path, str) else path.parts
 
 
-def _convert_columns(
+def _make_node_readings(
     rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, size: int
 ) -> NodeReadings:
     """Return the readings of one source from the fields of many messages.
@@ -262,7 +264,7 @@ def _convert_columns(
     """
     values = np.full((len(rows), size), np.nan)
     for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
-        value = _read_values(columns, path)
+        value = _compute_value_column(columns, path)
         values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
     # A stamp has to be set, so not 0, and of 32 bits, so that the nanoseconds fit into 64.
     time = np.full(len(rows), NONE)
@@ -281,7 +283,7 @@ def _convert_columns(
     return NodeReadings(rows, time, sequence.astype(np.int64), values, source.sequence.period)
 
 
-def _read_values(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
+def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
     """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
 
     Raises:

@@ -106,7 +106,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     pose.places(record.states)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    store = _load_types()
+    store = _load_ros2_message_types()
     times = _convert_times_to_nanoseconds(record.time, origin)
     # The type of each topic's messages.
     types = {
@@ -125,7 +125,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
         shutil.move(bag / f"{bag.name}.mcap", partial)
 
 
-def _load_types() -> Any:
+def _load_ros2_message_types() -> Any:
     """Return the types of ROS 2 Humble's messages."""
     from rosbags.typesys import Stores, get_typestore
 

@@ -22,14 +22,14 @@ LISTED = 8  # identifiers in one line
 Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether it has 29 bits
 
 
-def open_frames(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """Open a log of frames; without a database its messages are named by their identifiers and have no signals.
 
     Raises:
         ValueError: no database, or one that cannot be read.
         ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
     """
-    database = {} if sources.dbc is None else read_database(sources.dbc)
+    database = {} if sources.dbc is None else read_can_database(sources.dbc)
     notes = list[str]()
     units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
     kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
@@ -37,7 +37,7 @@ def open_frames(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read_messages(), notes, bits)
 
 
-def read_database(path: Path) -> Database:
+def read_can_database(path: Path) -> Database:
     """Return the messages of a database of a bus by their identifiers.
 
     Raises:
@@ -180,7 +180,7 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
     count = 0
     with ExitStack() as stack:
         try:
-            opened = _open_frames(path, stack)
+            opened = _open_frame_reader(path, stack)
         except (InputError, ModuleNotFoundError):
             raise
         except Exception as error:  # whatever a damaged file makes a reader do
@@ -208,7 +208,7 @@ class _OpenedFrames(NamedTuple):
     shift: float
 
 
-def _open_frames(path: Path, stack: ExitStack) -> _OpenedFrames:
+def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
     """Open a log of frames by the kind of its name: BLF, ASC, or else MDF4; the stack closes it.
 
     Raises:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
 
-from heliograph.files.logs.can_frames_to_messages import open_frames
+from heliograph.files.logs.can_frames_to_messages import open_frame_log
 from heliograph.files.logs.log_sources import STAMP, LogSources
 from heliograph.files.logs.mdf import open_mdf
 from heliograph.files.logs.ulog import open_ulog
@@ -69,7 +69,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         return open_ulog(path, sources, wanted)
     if kind in MDF and sources.dbc is None:
         return open_mdf(path, sources, wanted)
-    return open_frames(path, sources, wanted)
+    return open_frame_log(path, sources, wanted)
 
 
 def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:

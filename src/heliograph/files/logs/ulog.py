@@ -47,7 +47,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         if wanted(name)
     }
     # When the device began to run, in seconds since 1970; the sources may say when the log began, some time later.
-    begin = _find_date(file)
+    begin = _find_start_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND
     notes = list[str]()
@@ -58,7 +58,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
 
 
-def _find_date(file: "ULog") -> float:
+def _find_start_date(file: "ULog") -> float:
     """Return the date, in seconds since 1970, at which the device began to run; 0 if the log does not say it."""
     for data in file.data_list:
         if data.name in CLOCKS and DATE in data.data and len(known := np.flatnonzero(data.data[DATE])):

@@ -12,12 +12,12 @@ from heliograph.numerics.check import InputError, fail
 LISTED = 8  # files in one line
 
 
-def is_folder(path: Path) -> bool:
+def is_message_folder(path: Path) -> bool:
     """Return whether a path is a folder that may have files of messages: one that is no bag."""
     return path.is_dir() and not is_bag(path)
 
 
-def list_files(folder: Path) -> list[Path]:
+def list_message_files(folder: Path) -> list[Path]:
     """Return the files of messages in a folder, by name: tables and files of lines, not those in folders within it.
 
     Raises:
@@ -37,10 +37,10 @@ def find_topic_of_file(path: Path, sources: Sources) -> str:
 
 def list_used_files(folder: Path, sources: Sources) -> list[Path]:
     """Return the files of a folder that are topics of sources."""
-    return [path for path in list_files(folder) if sources.of(find_topic_of_file(path, sources))]
+    return [path for path in list_message_files(folder) if sources.of(find_topic_of_file(path, sources))]
 
 
-def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputError]:
+def read_message_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputError]:
     """Yield the messages of the files that are topics of sources, file by file, or why one cannot be read.
 
     Raises:
@@ -48,7 +48,7 @@ def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputE
     """
     files = list_used_files(folder, sources)
     if not files:
-        got = f"only {_join_names([path.name for path in list_files(folder)])}"
+        got = f"only {_join_names([path.name for path in list_message_files(folder)])}"
         raise fail(str(folder), f"a file that the sources name, {_join_names(sources.topics)}", got)
     for path in files:
         topic = find_topic_of_file(path, sources)
@@ -62,7 +62,7 @@ def read_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputE
 def describe_unused_files(folder: Path, sources: Sources) -> list[str]:
     """Return a line on the files that are no topics of sources, and one on the topics that are no files."""
     used = list_used_files(folder, sources)
-    rest = [path.name for path in list_files(folder) if path not in used]
+    rest = [path.name for path in list_message_files(folder) if path not in used]
     found = {find_topic_of_file(path, sources) for path in used}
     missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
     lines = [f"{folder}: not among the sources: {_join_names(rest)}"] if rest else []

@@ -80,9 +80,9 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if kind == ".parquet":
-        yield from (convert_row(where, row) for where, row in _read_parquet_rows(path))
+        yield from (make_message_of_row(where, row) for where, row in _read_parquet_rows(path))
     else:
-        yield from yield_until_cut_off(_read_lines(path) if kind in LINES else _read_csv_messages(path))
+        yield from yield_until_cut_off(_read_json_messages(path) if kind in LINES else _read_csv_messages(path))
 
 
 def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
@@ -97,10 +97,10 @@ def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
         return None
     inner = content[PAYLOAD]
     text = inner if isinstance(inner, str) else json.dumps(inner)
-    return content[TOPIC], text, find_arrival(content), bool(content.get("retain"))
+    return content[TOPIC], text, find_arrival_time(content), bool(content.get("retain"))
 
 
-def find_arrival(logged: Mapping[str, Any]) -> Any:
+def find_arrival_time(logged: Mapping[str, Any]) -> Any:
     """Return when a message with a payload was logged, as the log says it; None if it does not."""
     arrivals = [logged[name] for name in ARRIVALS if logged.get(name) is not None]
     arrivals += [logged[name] for name in CLOCKS if _is_moment(logged.get(name))]
@@ -119,25 +119,25 @@ def _is_moment(value: object) -> bool:
     return isinstance(number, int | float) and YEARS[0] <= number < YEARS[1]
 
 
-def convert_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     """Return the message of a row of a table.
 
     Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
     """
-    arrival = find_arrival(row) if PAYLOAD in row else row.get("arrival")
+    arrival = find_arrival_time(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
         return FileMessage(where, None, row, arrival)
     payload = row.get(PAYLOAD, row)
     return FileMessage(where, str(row[TOPIC]), payload, arrival)
 
 
-def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
+def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file of JSON, one document or one message a line; an error in place of a bad one."""
     with open_text(path) as file:
         if find_extension(path) == ".json":  # one document, of any number of lines, or one a line
             text = file.read()
             try:
-                yield from decode_document(text, str(path))
+                yield from parse_message_document(text, str(path))
                 return
             except InputError:
                 lines = enumerate(text.splitlines(), 1)
@@ -145,34 +145,34 @@ def _read_lines(path: Path) -> Iterator[FileMessage | InputError]:
             lines = enumerate(file, 1)
         for number, line in lines:
             if line.strip():
-                yield from convert_line(f"{path}, line {number}", line)
+                yield from parse_message_line(f"{path}, line {number}", line)
 
 
-def decode_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
+def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
     """Return the messages of a document of JSON, in lists or lists of lists; an error in place of a bad one.
 
     Raises:
         ValueError: no JSON; one line.
     """
     return [
-        _convert_item(f"{name}, message {n}", item, doubled)
+        _make_message_of_json(f"{name}, message {n}", item, doubled)
         for n, (item, doubled) in enumerate(decode_items(text, name), 1)
     ]
 
 
-def convert_line(where: str, line: str) -> list[FileMessage | InputError]:
+def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
     """Return the message of a line, those of a list of them, or why it cannot be read."""
     line = line.strip()
     if not is_valid_text(line):
         return [fail(where, "a text in UTF-8", show_value(line))]
     try:
-        return [_convert_item(where, *item) for item in decode_items(line, where)]
+        return [_make_message_of_json(where, *item) for item in decode_items(line, where)]
     except InputError as error:
         parts = parse_log_line(line)
         return [error if parts is None else FileMessage(where, *parts)]
 
 
-def _convert_item(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
+def _make_message_of_json(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
     """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file.
 
     An error in place of one that has a field twice.
@@ -189,7 +189,7 @@ def _convert_item(where: str, content: object, doubled: str | None) -> FileMessa
 def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of the rows of a CSV file, or why one cannot be read."""
     for row in read_csv_rows(path, marked=True):
-        yield row if isinstance(row, InputError) else convert_row(row.where, convert_cells(row))
+        yield row if isinstance(row, InputError) else make_message_of_row(row.where, convert_cells(row))
 
 
 def convert_cells(row: CsvRow) -> dict[str, Any]:
@@ -230,7 +230,7 @@ def _format_moment(nanoseconds: int) -> str:
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
-def decode_payload(message: FileMessage) -> object:
+def decode_message_content(message: FileMessage) -> object:
     """Return the content of a message, decoded from JSON where it is the payload of a log.
 
     Raises:

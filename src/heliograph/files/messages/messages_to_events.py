@@ -11,13 +11,13 @@ from heliograph.files.logs.vehicle_log import is_log
 from heliograph.files.messages.folder_of_message_files import (
     describe_unused_files,
     find_topic_of_file,
-    is_folder,
-    read_folder,
+    is_message_folder,
+    read_message_folder,
 )
 from heliograph.files.messages.message_files import (
     TOPIC,
     FileMessage,
-    decode_payload,
+    decode_message_content,
     is_message_file,
     make_default_topic,
     read_message_file,
@@ -29,7 +29,7 @@ from heliograph.files.messages.own_format import (
     OwnMessageCollector,
     holds_events,
     is_own_message,
-    is_table,
+    is_table_file,
 )
 from heliograph.files.sources.message_fields import parse_arrival
 from heliograph.files.sources.node_reading import Reading, Unread
@@ -112,7 +112,7 @@ def read_events(
         if checked is None:
             raise fail("sources", f"hg.files.LogSources for the messages of {source}", "none")
         events = _read_log(source, sources, checked, strict)
-    elif isinstance(source, Path) and is_folder(source) and checked is None:
+    elif isinstance(source, Path) and is_message_folder(source) and checked is None:
         raise fail("sources", f"a source for the files of {source}", "none")
     elif _holds_rows_of_own_format(source):
         events = _read_table_of_own_format(source, network, strict, ignore_unknown)
@@ -142,7 +142,7 @@ def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
         return named or _holds_rows_of_own_format(path)
-    if is_bag(path) or is_log(path) or is_folder(path) or holds_events(path) or is_message_file(path):
+    if is_bag(path) or is_log(path) or is_message_folder(path) or holds_events(path) or is_message_file(path):
         return True
     if find_extension(path) not in (".csv", ".parquet") or not isinstance(sources, Mapping) or not path.is_file():
         return False
@@ -154,10 +154,10 @@ def _holds_rows_of_own_format(source: Path | StoreTable) -> bool:
     return holds_events(source) if isinstance(source, Path) else {NODE, SEQUENCE} <= source.columns.keys()
 
 
-def _list_messages(source: Path | StoreTable, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+def _yield_messages(source: Path | StoreTable, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, of those files of a folder that are topics of sources, or of a store's table."""
-    if isinstance(source, Path) and is_folder(source) and sources is not None:
-        return read_folder(source, sources)
+    if isinstance(source, Path) and is_message_folder(source) and sources is not None:
+        return read_message_folder(source, sources)
     return read_message_file(source) if isinstance(source, Path) else source.messages()
 
 
@@ -166,7 +166,7 @@ def _read_table_of_own_format(
 ) -> EventTable:
     """Return the events of a table in our own form."""
     own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
-    for message in _list_messages(path):
+    for message in _yield_messages(path):
         own.add(message, strict)
     return own.events()
 
@@ -184,10 +184,10 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: Sources |
         ValueError: messages of both kinds, or of topics without sources.
     """
     events = None if sources is None else EventTable(network, sources.step_seconds)
-    is_rows = isinstance(path, StoreTable) or is_table(path)
+    is_rows = isinstance(path, StoreTable) or is_table_file(path)
     own = OwnMessageCollector(network, path, table=is_rows, ignore_unknown=False)
     broken = ""
-    for message in _list_messages(path, sources):
+    for message in _yield_messages(path, sources):
         if isinstance(message, CutOffError) and not strict:
             broken = str(message)
         # What cannot be read is counted with our own form first; at the end with whichever form was used.
@@ -252,7 +252,7 @@ def _append_message(
         if sources.take_device_word(topic, message.content, message.where):
             return
         # The payload of a topic that nobody asks for may be anything.
-        content = decode_payload(message) if sources.of(topic) else None
+        content = decode_message_content(message) if sources.of(topic) else None
         arrival = None if message.arrival is None else parse_arrival(message.arrival, f"{message.where}, arrival")
         for reading in sources.read(topic, content, message.where):
             if isinstance(reading, Unread):
@@ -310,8 +310,8 @@ def _note_left_out(path: Path | StoreTable, sources: Sources, events: EventTable
     """
     if said := sources.describe_absent_field():
         raise InputError(said)
-    from_zero = sources.clocks.check_dates(str(path))
-    if isinstance(path, Path) and is_folder(path) and not is_log(path):
+    from_zero = sources.clocks.find_topics_without_dates(str(path))
+    if isinstance(path, Path) and is_message_folder(path) and not is_log(path):
         events.notes += describe_unused_files(path, sources)
         if len(from_zero) > 1:
             remedy = "start= or offset= of hg.files.Stamp says if they are not"

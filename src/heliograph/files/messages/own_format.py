@@ -30,14 +30,14 @@ OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
 def holds_events(path: str | Path) -> bool:
     """Return whether a CSV or Parquet file has events instead of rows: it has the columns `node` and `sequence`."""
     path = Path(path)
-    if not path.is_file() or not is_table(path):
+    if not path.is_file() or not is_table_file(path):
         return False
     return {NODE, SEQUENCE} <= set(
         read_parquet_names(path) if find_extension(path) == ".parquet" else read_csv_header(path)
     )
 
 
-def is_table(path: Path) -> bool:
+def is_table_file(path: Path) -> bool:
     """Return whether a file has rows, by its name."""
     return find_extension(path) in (".csv", ".parquet")
 
@@ -164,20 +164,20 @@ class OwnMessageReader:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
         sequence = _parse_whole_number(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
         # Without an arrival it arrived when it was measured. A table has the column or not: an empty cell is an error.
-        time, dated = self._read_moment(row[TIME], where, TIME)
+        time, dated = self._read_time(row[TIME], where, TIME)
         arrival = time
         if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
-            arrival, _ = self._read_moment(row[ARRIVAL], where, ARRIVAL)
+            arrival, _ = self._read_time(row[ARRIVAL], where, ARRIVAL)
         plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
         self.numbers = not dated
         try:
-            values = _read_values(row, self.components[node], where, node in self._numbered)
+            values = _read_event_values(row, self.components[node], where, node in self._numbered)
         except InputError as error:
             return [(Unread(error, Reading(plant, node, sequence, time, NOTHING)), arrival)]
         events: list[tuple[Reading | Unread, Any]] = []
         # A message of a node may bring the inputs that were set then: an event of their own.
         if isinstance(row.get(INPUTS), list) and node != INPUTS:
-            inputs = _read_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
+            inputs = _read_event_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
             events.append((Reading(plant, INPUTS, sequence, time, inputs), arrival))
         return [*events, (Reading(plant, node, sequence, time, values), arrival)]
 
@@ -201,7 +201,7 @@ class OwnMessageReader:
                 raise error_type(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
         self._columns = row.keys()
 
-    def _read_moment(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
+    def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
         """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
         name = f"{where}, column {column!r}"
         dated = isinstance(cell, str) and looks_like_date(cell)
@@ -239,7 +239,7 @@ class HeaderError(InputError):
     """The columns of a file are not those of events."""
 
 
-def _read_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
+def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
     """Return the values of one event, NaN where one did not arrive.
 
     They stand in the field `values`, a list or a text, or each in a field of its name. Where the event is `numbered`

@@ -137,7 +137,7 @@ def field_at(message: object, path: str, where: str) -> Any:
     # A message of a bag is an object with attributes, and there are millions: all of the path at once, if it has them.
     if path and not isinstance(message, PLAIN):
         with suppress(AttributeError):
-            return _attribute_getter(path)(message)
+            return _make_attribute_getter(path)(message)
     value: Any = message
     rest = path
     while rest:
@@ -158,7 +158,7 @@ def field_at(message: object, path: str, where: str) -> Any:
 
 
 @lru_cache
-def _attribute_getter(path: str) -> "attrgetter[Any]":
+def _make_attribute_getter(path: str) -> "attrgetter[Any]":
     """Return what reads a dotted path of attributes."""
     return attrgetter(path)
 

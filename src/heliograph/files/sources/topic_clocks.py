@@ -32,7 +32,7 @@ class TopicClock:
     far_from_1970: int = 0
 
     @property
-    def from_zero(self) -> bool:
+    def counts_from_own_start(self) -> bool:
         """Return whether it counts from its own start: its times are numbers, of which most are within a year of 0."""
         return self.numbers and 2 * self.far_from_1970 <= self.count
 
@@ -53,13 +53,13 @@ class TopicClocks:
         clock.count += 1
         clock.far_from_1970 += abs(time) >= YEAR
 
-    def check_dates(self, place: str) -> list[str]:
+    def find_topics_without_dates(self, place: str) -> list[str]:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
         Raises:
             ValueError: some count from their own start and others are dates; one line with the remedy.
         """
-        from_zero = [topic for topic, clock in self._by_topic.items() if clock.from_zero]
+        from_zero = [topic for topic, clock in self._by_topic.items() if clock.counts_from_own_start]
         dated = next((topic for topic in self._by_topic if topic not in from_zero), None)
         if from_zero and dated is not None:
             topic, clock = from_zero[0], self._by_topic[from_zero[0]]

@@ -15,7 +15,12 @@ from urllib.parse import urlencode, urlsplit
 
 import numpy as np
 
-from heliograph.files.stores.influx_responses import read_flux, read_influxql, read_sql_rows, shorten_answer
+from heliograph.files.stores.influx_responses import (
+    parse_flux_response,
+    parse_influxql_response,
+    parse_sql_response,
+    shorten_answer,
+)
 from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
@@ -35,12 +40,12 @@ def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     query = address.query or f'SELECT * FROM "{_escape_name(address.table, chr(34))}"'
     match address.language:
         case "flux":
-            return read_flux(address, _send_request(address, "POST", *_make_flux_request(address)))
+            return parse_flux_response(address, _send_request(address, "POST", *_make_flux_request(address)))
         case "sql":
             target = urlencode({"db": address.database, "q": query, "format": "json"})
-            return read_sql_rows(address, _send_request(address, "GET", f"/api/v3/query_sql?{target}"))
+            return parse_sql_response(address, _send_request(address, "GET", f"/api/v3/query_sql?{target}"))
     answer = _send_request(address, "GET", f"/query?{urlencode({'db': address.database, 'q': query, 'epoch': 'ns'})}")
-    return read_influxql(address, answer)
+    return parse_influxql_response(address, answer)
 
 
 def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:

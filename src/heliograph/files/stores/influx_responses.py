@@ -15,7 +15,7 @@ Answer = tuple[str, dict[str, Any]]  # the measurement's name and its columns: l
 Row = Mapping[str, Any]
 
 
-def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
+def parse_influxql_response(address: StoreAddress, answer: bytes) -> Answer:
     """Return the table of an answer to InfluxQL; several series, as of GROUP BY, become one, with tags as columns.
 
     Raises:
@@ -44,7 +44,7 @@ def read_influxql(address: StoreAddress, answer: bytes) -> Answer:
     return measurement, _make_columns(address, names, rows, read_time=lambda time: int(time), sorts=is_unsorted)
 
 
-def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
+def parse_sql_response(address: StoreAddress, answer: bytes) -> Answer:
     """Return the table of an answer of version 3 to SQL, a list of rows, each an object of JSON.
 
     Raises:
@@ -60,7 +60,7 @@ def read_sql_rows(address: StoreAddress, answer: bytes) -> Answer:
     return address.database, _make_columns(address, names, rows, read_time=_read_moment, sorts=False)
 
 
-def read_flux(address: StoreAddress, answer: bytes) -> Answer:
+def parse_flux_response(address: StoreAddress, answer: bytes) -> Answer:
     """Return the table of an answer to Flux: tables of CSV, each row of which has one field's value at one time.
 
     Values of one measurement, one time and the same tags are one row, as after `pivot`, which a query may do itself.

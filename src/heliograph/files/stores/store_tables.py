@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.estimates.estimates_table import estimate_columns
-from heliograph.files.messages.message_files import FileMessage, convert_row
+from heliograph.files.messages.message_files import FileMessage, make_message_of_row
 from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
 from heliograph.files.table import TIME, convert_to_columns
 from heliograph.files.table_rows import TableRows
@@ -50,7 +50,7 @@ class StoreTable:
         names = list(self.columns)
         for number, cells in enumerate(zip(*self.columns.values(), strict=True), 1):
             row = {name: _convert_cell(cell) for name, cell in zip(names, cells, strict=True)}
-            yield convert_row(f"{self}, row {number}", row)
+            yield make_message_of_row(f"{self}, row {number}", row)
 
 
 def _convert_cell(cell: object) -> object:

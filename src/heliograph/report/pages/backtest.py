@@ -85,7 +85,7 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
     )
 
 
-def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
+def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
     """Return the verdict on each filter by its intervals and what came, the largest share of misses first."""
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
@@ -96,9 +96,9 @@ def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdic
     return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))
 
 
-def list_doubts(found: "heliograph.forecasting.Backtest") -> list[str]:
+def describe_coverage_misses(found: "heliograph.forecasting.Backtest") -> list[str]:
     """Return a line for each coverage that is further from what was claimed than chance explains."""
-    return [f"{v.name}, {miss.describe()}" for v in judge_filters(found) for miss in v.misses]
+    return [f"{v.name}, {miss.describe()}" for v in judge_forecasts_of_filters(found) for miss in v.misses]
 
 
 @matplotlib.rc_context(STYLE)
@@ -145,7 +145,7 @@ def make_backtest_page(
         drawings: each figure as SVG.
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
-    verdicts = judge_filters(found)
+    verdicts = judge_forecasts_of_filters(found)
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
         "ahead, as if nothing more arrived; scored is what came."
@@ -203,4 +203,9 @@ def _list_all_numbers(found: "heliograph.forecasting.Backtest") -> dict[str, Jso
         return float(value) if isinstance(value, float) and np.isfinite(value) else None
 
     scores: list[Json] = [{name: convert_to_json(value) for name, value in s.row().items()} for s in found.scores]
-    return {"rows": found.rows, "horizons": list(found.horizons), "warnings": list_doubts(found), "scores": scores}
+    return {
+        "rows": found.rows,
+        "horizons": list(found.horizons),
+        "warnings": describe_coverage_misses(found),
+        "scores": scores,
+    }

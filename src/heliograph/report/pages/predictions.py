@@ -26,7 +26,9 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 def draw_predicted_figures(health: Health) -> dict[str, Figure]:
     """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for."""
-    figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_nodes(health)[:MOST])}
+    figures = {
+        f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_predicting_nodes(health)[:MOST])
+    }
     for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
         figures[f"residuals_{i}"] = judged.figure(health.record.time)
     return figures
@@ -43,7 +45,7 @@ def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> li
         "What each filter expected of a row, given the rows before it: also where nothing arrived. Of what arrived, "
         "95 of 100 should lie in the band of a filter whose claim is exact."
     )
-    nodes = _list_nodes(health)
+    nodes = _list_predicting_nodes(health)
     pictures = {}
     for i, node in enumerate(nodes[:MOST]):
         if (name := f"predicted_{i}") in drawings:
@@ -84,7 +86,7 @@ def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> li
     return [Section("Residuals", [Text([text]), Text(sentences), *choose_picture(pictures)])] if every else []
 
 
-def _list_nodes(health: Health) -> list[str]:
+def _list_predicting_nodes(health: Health) -> list[str]:
     """Return the names of nodes with a filter that predicts what arrives."""
     return [
         node

@@ -106,13 +106,15 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
-            node = _nodes_to_draw(record)[0]
+            node = _choose_nodes_to_draw(record)[0]
             drawn[_name_position_map(kind)] = draw_position_map(
                 record, node, list(record.estimates[node])[: len(COLOURS)]
             )
     for kind, record in _collect_estimates(health):
-        drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
-        drawn |= draw_modes_of_nodes(record, kind, _nodes_to_draw(record))
+        drawn |= {
+            f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_choose_nodes_to_draw(record))
+        }
+        drawn |= draw_modes_of_nodes(record, kind, _choose_nodes_to_draw(record))
     drawn |= {name: draw_innovations(health, tested) for name, tested in group_tested_filters_by_figure(health).items()}
     drawn |= draw_predicted_figures(health)
     if health.links:
@@ -131,7 +133,7 @@ def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
     return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
 
-def _nodes_to_draw(record: Record) -> list[str]:
+def _choose_nodes_to_draw(record: Record) -> list[str]:
     """Return the nodes that are drawn, the fused estimate first."""
     return _sort_nodes(record)[:MOST]
 
@@ -180,8 +182,8 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     forecasts = [Section("Forecasts", make_forecast_tables(record, health.forecasts))] if health.forecasts else []
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
-        title=_find_headline(health),
-        lead=f"The filters of `{visible(network)}` ran over {rows}. {_describe_agreement(health, doubts)}",
+        title=_make_headline(health),
+        lead=f"The filters of `{visible(network)}` ran over {rows}. {_describe_number_of_doubts(health, doubts)}",
         sections=[
             Section("At a glance", glance),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
@@ -221,13 +223,13 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
     return kept
 
 
-def _find_headline(health: Health) -> str:
+def _make_headline(health: Health) -> str:
     """Return the title of a run's page: the last estimate of the filter that the network relies on.
 
     Its first two states, or its position, with bands where it claims a covariance.
     """
     record = health.record
-    nodes = _nodes_to_draw(record)
+    nodes = _choose_nodes_to_draw(record)
     if not nodes:
         return f"{len(record.time):,} rows were read"
     node = nodes[0]
@@ -253,7 +255,7 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
     """
     pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):
-        nodes = _nodes_to_draw(record)  # the first few: estimates of others are in the record alone
+        nodes = _choose_nodes_to_draw(record)  # the first few: estimates of others are in the record alone
         added = ", given later data too" if kind == "smoothed" else ""
         if (name := _name_position_map(kind)) in drawings:
             text = f"The path that {visible(nodes[0])} estimates{added}"
@@ -295,7 +297,7 @@ def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
     return f"{state} ({units[state]})" if state in units else state
 
 
-def _describe_agreement(health: Health, doubts: list[str]) -> str:
+def _describe_number_of_doubts(health: Health, doubts: list[str]) -> str:
     """Return the sentence on how many doubts there are about the network, or that there are none."""
     if doubts:
         return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from heliograph.files.messages.message_files import FileMessage, convert_line, decode_document
+from heliograph.files.messages.message_files import FileMessage, parse_message_document, parse_message_line
 from heliograph.files.messages.own_format import OwnMessageReader, is_own_message
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
@@ -111,14 +111,14 @@ class LineReader:
         if not isinstance(read, str | UnreadMessage):
             self._is_table = False
             return [read]
-        messages = convert_line(f"{self.source}, line {self._number}", _decode_line(line))
+        messages = parse_message_line(f"{self.source}, line {self._number}", _decode_line(line))
         return [payload for message in messages for payload in self._interpret_message(message, read)]
 
     def _read_document_or_lines(self, lines: list[bytes]) -> list[Payload]:
         """Return the messages of a JSON document of several lines, or else of each line by itself."""
         self._document = None
         with suppress(InputError):
-            found = decode_document(b"\n".join(lines), self.source)
+            found = parse_message_document(b"\n".join(lines), self.source)
             return [payload for message in found for payload in self._interpret_message(message, None)]
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.csv_columns import CsvColumnReader
-from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, convert_row
+from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
 from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnMessageReader
 from heliograph.files.recording import RowReader
 from heliograph.files.recording_rows import RecordingRows, join_recording_rows
@@ -85,7 +85,7 @@ class TableLineReader:
             topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
                 return MessageRowReader(
-                    lambda row: translator.decode(convert_row(row.where, convert_cells(row)), topic)
+                    lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
                 )
         return TimeRowReader(self._network, header, self._text, self._ignore)
 
@@ -162,7 +162,7 @@ class TimeRowReader:
             return []
         with warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", UserWarning)
-            recording, self._cells = self._rows.arrange(join_recording_rows(self._cells)), []
+            recording, self._cells = self._rows.arrange_recording(join_recording_rows(self._cells)), []
         for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
             LOG.warning("%s", line)
         events, origin = events_of_recording(recording, self._network)
