@@ -65,7 +65,7 @@ class Finder:
     def find_spec(self, name, path=None, target=None):
         if name in ("heliograph.cli", "heliograph.files.network_file", "jax"):
             say(name)
-        if name == "heliograph.report.results":
+        if name == "heliograph.report.results_folder":
             import heliograph.report.progress as module
             bar = module.progress
             from contextlib import contextmanager

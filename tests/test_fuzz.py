@@ -165,7 +165,7 @@ WORDS = [
 def test_any_command_line_ends_with_a_code_and_at_most_a_line(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     stub = SimpleNamespace(settings=lambda values: values, run=lambda *_: None)
-    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: stub)  # what takes minutes is not run
+    monkeypatch.setattr("heliograph.cli.studies.load_study", lambda entry: stub)  # what takes minutes is not run
     capsys.readouterr()
     code = cli.main(words)
     said = capsys.readouterr()

@@ -159,7 +159,7 @@ def test_every_method_finds_what_it_needs(after_make_demo, monkeypatch):
     def begin(target):
         raise BegunError
 
-    monkeypatch.setattr("heliograph.report.results.whole_folder", begin)
+    monkeypatch.setattr("heliograph.report.results_folder.whole_folder", begin)
     methods = [e.name for e in entry_points(group="heliograph.studies") if e.attr == "publication"]
     assert len(methods) == 5
     for method in methods:
@@ -174,7 +174,7 @@ def test_its_network_is_as_short_as_it_says():
 
 def test_every_command_that_it_names_in_passing_is_one():
     """What is too long to run here is at least understood: its options too."""
-    from heliograph.cli.app import app
+    from heliograph.cli.app_and_option_types import app
 
     named = [text for text in re.findall(r"`heliograph ([^`]*)`", README) if "$" not in text]
     assert len(named) >= 2

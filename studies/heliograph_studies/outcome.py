@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from heliograph.report.results import Json
+from heliograph.report.results_folder import Json
 
 T = TypeVar("T")
 UNLISTED, INLINE = "unlisted", "inline"

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from heliograph.disk.whole_file import whole_file
+from heliograph.disk.atomic_files import whole_file
 from heliograph.numerics.check import InputError, error_text, fail
 from heliograph.report.progress import Advance
 

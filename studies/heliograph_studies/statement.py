@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from heliograph.report.results import Json
+from heliograph.report.results_folder import Json
 
 Verdict = Literal["holds", "holds_vacuously", "does_not_apply", "fails"]
 OURS = "not in the paper"  # the source of a statement that this page adds

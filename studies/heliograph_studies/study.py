@@ -15,7 +15,7 @@ import heliograph
 from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.report.pages.page import KeyFigures, Page, Section, Table
 from heliograph.report.progress import Advance, progress
-from heliograph.report.results import Results, write_results
+from heliograph.report.results_folder import ResultsContent, write_results
 from heliograph_studies import markdown
 from heliograph_studies.outcome import summary
 from heliograph_studies.settings import content, differences, digest, with_values
@@ -95,7 +95,7 @@ class Study(Generic[Setting, Outcome]):
             stages.advance = advance
             return self.compute(chosen, stages)
 
-        def results_of(outcome: Outcome) -> Results:
+        def results_of(outcome: Outcome) -> ResultsContent:
             stages.stage = "drawing and writing"
             return self._results(chosen, outcome, lines)
 
@@ -105,7 +105,7 @@ class Study(Generic[Setting, Outcome]):
         print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome
 
-    def _results(self, setting: Setting, outcome: Outcome, lines: list[str]) -> Results:
+    def _results(self, setting: Setting, outcome: Outcome, lines: list[str]) -> ResultsContent:
         """What the folder holds; its findings go to `lines`."""
         statements = self.statements(outcome)
 
@@ -115,7 +115,7 @@ class Study(Generic[Setting, Outcome]):
             return made
 
         numbers = self.summary(setting, outcome, statements)
-        return Results(self.figures(outcome), page, numbers, partial(self.data, outcome))
+        return ResultsContent(self.figures(outcome), page, numbers, partial(self.data, outcome))
 
     def summary(self, setting: Setting, outcome: Outcome, statements: Judged) -> dict[str, Any]:
         """All numbers: the outcome's fields, which setting they are of, and the statements with their evidence."""

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.read import load_campaign
+from heliograph.campaign.campaign_file import load_campaign
+from heliograph.campaign.definition import Campaign
 
 NETWORK = """
 import os

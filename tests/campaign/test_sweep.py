@@ -3,8 +3,8 @@
 import pytest
 
 from heliograph import cli
-from heliograph.campaign.failures import Failure
-from heliograph.campaign.page import draw_campaign_figures, write_campaign_page
+from heliograph.campaign.failed_jobs import FailedJob
+from heliograph.campaign.report_page import draw_campaign_figures, make_campaign_page
 from heliograph.campaign.summary import read_summary
 from heliograph.report.progress import Countdown, format_remaining
 from tests.campaign.example import CAMPAIGN, write
@@ -108,8 +108,8 @@ def test_words_make_no_axis(tmp_path, finished):
 
 @pytest.mark.slow
 def test_the_page_says_what_failed(tmp_path, finished, fits):
-    entry = Failure(3, {"gain": 0.7}, 1, (64, 99), (5, 0, 0), "RuntimeError: <bad> luck", "", "heliograph sweep x")
-    html = write_campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
+    entry = FailedJob(3, {"gain": 0.7}, 1, (64, 99), (5, 0, 0), "RuntimeError: <bad> luck", "", "heliograph sweep x")
+    html = make_campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
     fits(html)
     for text in ("What failed", "RuntimeError: &lt;bad&gt; luck", "heliograph sweep x", "runs 64 to 99"):
         assert text in html

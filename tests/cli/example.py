@@ -57,4 +57,4 @@ def refused(folder, capsys, arguments, *fragments) -> str:
 def stub_study(monkeypatch, run) -> None:
     """Any study is one that calls `run` with its folder and its values."""
     study = SimpleNamespace(settings=dict, run=lambda values, out: run(out, values))
-    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: study)
+    monkeypatch.setattr("heliograph.cli.studies.load_study", lambda entry: study)

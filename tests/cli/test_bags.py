@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.files.bags.output import Pose, pose_of
+from heliograph.files.bags.estimates_writer import Pose, find_pose_states
 from tests.files import bags
 
 RUN = ["run", "net.py", "--measurements", "drive/drive.mcap"]
@@ -89,9 +89,9 @@ def test_inspect_lists_topics_and_suggests_sources(folder, capsys):
 
 def test_a_pose_takes_states_by_name():
     """A heading of 90 degrees turns about z; states that nobody names leave their axis at 0."""
-    from heliograph.files.bags.output import _convert_angles_to_quaternion
+    from heliograph.files.bags.estimates_writer import _convert_angles_to_quaternion
 
-    assert pose_of(("x", "theta", "vyaw")).places(("x", "theta", "vyaw")) == (
+    assert find_pose_states(("x", "theta", "vyaw")).places(("x", "theta", "vyaw")) == (
         [0, None, None, None, None, None],
         [None, None, None, None, None, 2],
     )

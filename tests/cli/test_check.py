@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.cli.app import app
+from heliograph.cli.app_and_option_types import app
 from heliograph.cli.command import COMMANDS
 from tests.cli.example import refused
 

@@ -60,7 +60,7 @@ class Untried:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "option"), PLACES)
 def test_a_value_is_used_or_refused_in_one_line(folder, capsys, monkeypatch, name, option):
-    monkeypatch.setattr(studies, "load", lambda entry: Untried(entry.load()))
+    monkeypatch.setattr(studies, "load_study", lambda entry: Untried(entry.load()))
     for picture in ("png", "svg"):  # drawn seven times they are most of what a report costs
         monkeypatch.setattr(f"heliograph.report.figures.{picture}", lambda figure: b"<svg></svg>")
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))

@@ -60,7 +60,7 @@ def test_bash_completes_a_word(capsys):
 def test_results_are_not_put_one_folder_deeper_than_said(monkeypatch, out, expected):
     calls = []
     study = SimpleNamespace(settings=lambda values: values, run=lambda setting, place: calls.append(str(place)))
-    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: study)
+    monkeypatch.setattr("heliograph.cli.studies.load_study", lambda entry: study)
     assert cli.main(["example", "uwb", "--out", out]) == 0 and calls == [expected]
     assert cli.main(["reproduce", "quadratic-bias", "--out", out.replace("uwb", "quadratic-bias")]) == 0
     assert calls[1] == expected

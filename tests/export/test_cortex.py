@@ -12,7 +12,7 @@ import heliograph as hg
 from tests.export.device import FLAGS
 from tests.export.test_apart import MAKERS, SENSOR, VEHICLE
 from tests.export.test_far_origin import CAR
-from tests.export.test_window import ANGLES, TURN
+from tests.export.test_late_measurement_window import ANGLES, TURN
 
 CAR_SENSOR = hg.Sensor(lambda x: jnp.stack([x[0], x[1], x[2], x[4]]), np.diag([1.0, 1.0, 0.01, 1e-4]))
 CROSS = "arm-none-eabi"

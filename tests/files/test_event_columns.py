@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.event_columns import count_gaps
-from heliograph.files.sources.reading import Reading
+from heliograph.files.event_columns import count_missing_messages
+from heliograph.files.sources.node_reading import Reading
 
 MOVING = hg.Plant(lambda x, u: x, lambda u: 0.1 * u[:1, None], [0.0], 1.0, states=["x"], inputs=["dt"])
 COUNTING = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, states=["x"])
@@ -59,7 +59,7 @@ def test_verdicts_on_all_at_once_are_those_one_after_another(plant):
 )
 def test_gaps_in_a_count_are_lost_messages(counts, period, expected):
     order = np.random.default_rng(0).permutation(len(counts))  # whatever overtook what
-    assert count_gaps(np.arange(len(counts))[order], np.array(counts)[order], period) == expected
+    assert count_missing_messages(np.arange(len(counts))[order], np.array(counts)[order], period) == expected
 
 
 def test_stamps_that_nobody_set_are_left_out_and_those_of_another_clock_are_not():

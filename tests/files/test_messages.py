@@ -189,7 +189,7 @@ def test_inputs_hold_and_repeated_events_count_once(world):
     """Input 2 from second 1 on: the row at 1 has what held before it, the next has 2; time since the row before."""
     network, *_ = world
     table = hg.files.EventTable(network)
-    from heliograph.files.sources.reading import Reading
+    from heliograph.files.sources.node_reading import Reading
 
     second = 10**9
     for node, time, value in (("gps", 3, 7.0), ("inputs", 1, 2.0), ("gps", 0, 5.0), ("gps", 3, 7.0)):
@@ -285,13 +285,13 @@ def test_a_folder_of_bags_is_read_as_one(world, tmp_path):
 
 
 def test_a_stamp_with_an_offset_is_the_same_one_by_one(world, monkeypatch):
-    from heliograph.files.bags.message_layout import Decoder
+    from heliograph.files.bags.batch_decoder import BatchDecoder
 
     network, _, drive, path = world
     field = hg.files.json_field("pose.pose.position.x", "gps", time=hg.files.Stamp("header.stamp", -0.05))
     yaw = hg.files.json_field(hg.files.Yaw("pose.pose.orientation"), "inputs", time="header.stamp")
     table = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
-    monkeypatch.setattr(Decoder, "append_events", lambda decoder, batch, table: False)
+    monkeypatch.setattr(BatchDecoder, "append_events", lambda decoder, batch, table: False)
     one = hg.files.read_messages(path, network, {"/odometry": [field, yaw]})
     order = np.argsort(drive.logged, kind="stable")
     assert list(table.columns["gps"].time) == (drive.measured[order] - 5 * 10**7).tolist()

@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.sources import Sources, Unread, convert_time, decode_json, match_topic
-from heliograph.files.sources.fields import field_at
+from heliograph.files.sources.message_fields import field_at
 
 json_field = hg.files.json_field
 PLANT = hg.Plant(

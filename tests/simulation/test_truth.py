@@ -6,8 +6,8 @@ import pytest
 import heliograph as hg
 from heliograph.cli.run import run as command
 from heliograph.report import examine, run_summary
-from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.run import make_errors_table
+from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
 PLANT = hg.LinearPlant([[1.0, 0.2], [0.0, 0.9]], 0.1 * np.eye(2), [0.0, 0.0], np.eye(2), states=["place", "speed"])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3, outputs=["range"])
@@ -90,7 +90,7 @@ def test_the_report_shows_the_errors():
     size = record.nees("a", "f").mean() / 2
     assert table.rows[0][:2] == ["a/f", "exact"]
     # The standard error of a mean square over twice the root, by numbers that are far enough apart to be independent.
-    (of,) = compare_with_truth(record)
+    (of,) = compute_filter_errors(record)
     assert of.rmse == rmse
     for shown, (state, error) in zip(table.rows[0][2:4], of.rmse_error.items(), strict=True):
         assert (
@@ -110,7 +110,7 @@ def test_the_command_says_how_far_off(tmp_path, capsys):
     command(f"{tmp_path}/net.py", measurements=tmp_path / "data.csv", out=tmp_path / "out.csv")
     record = hg.run(NETWORK, *recording)
     rmse = record.rmse("a", "f")
-    (of,) = compare_with_truth(record)
+    (of,) = compute_filter_errors(record)
     place, speed = (round_to(value, of.rmse_error[state]) for state, value in rmse.items())
     line = f"a/f: RMSE of place {place}, of speed {speed}; NEES per state "
     assert line in capsys.readouterr().out

@@ -1,9 +1,9 @@
 """Public names of the room; the package loads them when first used."""
 
-from .plan import (
+from .definition import (
     Campaign as Campaign,
 )
-from .read import (
+from .campaign_file import (
     load_campaign as load_campaign,
 )
 from .run import (

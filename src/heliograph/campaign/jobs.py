@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.campaign.plan import Campaign, Chunk, parse_campaign, versions
-from heliograph.campaign.store import (
+from heliograph.campaign.definition import Campaign, Chunk, collect_versions, parse_campaign
+from heliograph.campaign.zarr_store import (
     AxisLabels,
     NetworkDescription,
-    check_within,
+    check_labels_within,
     describe_network,
     read_labels,
     restore_labels,
@@ -84,7 +84,7 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = read_labels(store)
-    check_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
+    check_labels_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
     # Full width, whatever the chunk has; only its own runs are written.
     recorded = monte_carlo(
         network,
@@ -112,7 +112,7 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
 
 def _check_versions(campaign: Campaign) -> None:
     """Refuse a worker whose packages or settings are not those that the campaign was begun with (ValueError)."""
-    here = versions()
+    here = collect_versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
 

@@ -7,27 +7,27 @@ from pathlib import Path
 
 from typing_extensions import TypeAliasType
 
-from heliograph.campaign.engines import Engine, start_engine
-from heliograph.campaign.failures import Failure, describe_failure, write_failures
+from heliograph.campaign.definition import Campaign
+from heliograph.campaign.failed_jobs import FailedJob, make_failed_job, write_failures
+from heliograph.campaign.job_engines import Engine, start_engine
 from heliograph.campaign.jobs import Job, Reply
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import (
+from heliograph.campaign.summary import SUMMARY, write_summary
+from heliograph.campaign.zarr_store import (
     STORE,
     NetworkDescription,
+    check_labels_within,
     check_same_campaign,
-    check_within,
     create_store,
-    find_described,
+    find_described_settings,
     find_done_chunks,
     read_labels,
-    remove_damaged,
-    remove_partial,
+    remove_damaged_chunks,
+    remove_partial_files,
     restore_labels,
     unite_labels,
     write_claims,
 )
-from heliograph.campaign.summary import SUMMARY, write_summary
-from heliograph.disk.whole_file import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
+from heliograph.disk.atomic_files import check_folder_writable, check_replaceable, lock_folder, remove_leftover_folders
 from heliograph.numerics.check import check_count, check_progress, fail, file_path, instance
 from heliograph.numerics.module import readable
 
@@ -52,7 +52,7 @@ class CampaignRun:
     folder: Path
     already: int
     computed: int
-    failures: list[Failure]
+    failures: list[FailedJob]
     damaged: list[Path]
 
 
@@ -111,7 +111,7 @@ def _compute_missing(
     remove_leftover_folders(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     expected = _list_jobs(campaign, only)
-    done, damaged = _clean_store(store, campaign)
+    done, damaged = _remove_damaged_and_partial(store, campaign)
     missing = [job for job in expected if (job.setting, job.chunk) not in done]
     already = len(expected) - len(missing)
     if not missing and not damaged and (out / SUMMARY).is_file():
@@ -121,10 +121,10 @@ def _compute_missing(
         count = _count_workers(workers, len(missing) or 1)  # one where only what was damaged is described again
         with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it is not right for what is computed now
-            failed = _compute_settings(engine, campaign, store, missing, already, progress)
-    remove_partial(store)
+            failed = _describe_settings_and_compute_chunks(engine, campaign, store, missing, already, progress)
+    remove_partial_files(store)
     # Reports are written again after every call.
-    failures = [describe_failure(campaign, out, job, reply) for job, reply in failed.items()]
+    failures = [make_failed_job(campaign, out, job, reply) for job, reply in failed.items()]
     write_failures(out, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     # A job without a chunk is that of a setting, whose network could not be built.
@@ -132,7 +132,7 @@ def _compute_missing(
     return CampaignRun(out, already, computed=len(missing) - lacking, failures=failures, damaged=damaged)
 
 
-def _clean_store(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]], list[Path]]:
+def _remove_damaged_and_partial(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]], list[Path]]:
     """Remove damaged and partial files from a store; return (setting, chunk) of what is done, and the damaged files.
 
     Raises:
@@ -141,12 +141,12 @@ def _clean_store(store: Path, campaign: Campaign) -> tuple[set[tuple[int, ...]],
     if not store.is_dir():
         return set(), []
     check_same_campaign(store, campaign)
-    damaged = remove_damaged(store, campaign)
-    remove_partial(store)
+    damaged = remove_damaged_chunks(store, campaign)
+    remove_partial_files(store)
     return find_done_chunks(store, campaign), damaged
 
 
-def _compute_settings(
+def _describe_settings_and_compute_chunks(
     engine: Engine,
     campaign: Campaign,
     store: Path,
@@ -206,7 +206,7 @@ def _prepare_store(
     else:
         # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
         begun = {setting for setting, _ in find_done_chunks(store, campaign)}
-        without_claims = sorted((settings | begun) - {setting for (setting,) in find_described(store)})
+        without_claims = sorted((settings | begun) - {setting for (setting,) in find_described_settings(store)})
     jobs = [Job(setting) for setting in without_claims]
     described: dict[int, NetworkDescription] = {}
 
@@ -225,7 +225,7 @@ def _prepare_store(
     if is_new:
         create_store(store, campaign, unite_labels(labels))
     for setting, labels_of_setting in labels.items():
-        check_within(labels_of_setting, read_labels(store), setting)
+        check_labels_within(labels_of_setting, read_labels(store), setting)
         write_claims(store, setting, described[setting]["claims"])
     return failed
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, get_type_hints
 import numpy as np
 import zarr
 
-from heliograph.campaign.plan import Campaign
-from heliograph.campaign.store import CLAIM, STORE, find_done_chunks, read_labels
-from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import name_path_in_errors, replace
+from heliograph.campaign.definition import Campaign
+from heliograph.campaign.zarr_store import CLAIM, STORE, find_done_chunks, read_labels
+from heliograph.disk.atomic_files import name_path_in_errors, replace
+from heliograph.disk.quoted_text import quote_for_cell, unquote_cell
 from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def read_summary(path: str | Path) -> list[Score]:
     return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
 
 
-def summarize(store: Path, campaign: Campaign) -> list[Score]:
+def compute_scores(store: Path, campaign: Campaign) -> list[Score]:
     """Return the scores of every filter by setting and node; the store is read chunk by chunk."""
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims = np.asarray(group[CLAIM])  # (setting, node, filter), "" where the node has no such filter
@@ -136,8 +136,8 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
     `squared`, `nees`: its squared error and NEES in each run (run,).
     """
     finite = np.isfinite(squared)
-    mse, mse_error = _compute_mean(squared[finite])
-    mean_nees, nees_error = _compute_mean(nees[finite])
+    mse, mse_error = _compute_mean_and_error(squared[finite])
+    mean_nees, nees_error = _compute_mean_and_error(nees[finite])
     rmse = float(np.sqrt(mse))
     return Score(
         setting=setting,
@@ -153,20 +153,20 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
     )
 
 
-def _compute_mean(values: np.ndarray) -> tuple[float, float]:
+def _compute_mean_and_error(values: np.ndarray) -> tuple[float, float]:
     """Return the mean of independent values and its standard error; NaN of too few."""
     if not len(values):
         return np.nan, np.nan
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
 
 
-def score_headers(campaign: Campaign) -> list[str]:
+def make_score_headers(campaign: Campaign) -> list[str]:
     """Return the headers of the table of scores."""
     return [*campaign.parameters, "node", "filter", "claim", "RMSE", "±", "NEES / dim", "±", "finite runs"]
 
 
-def score_row(campaign: Campaign, score: Score) -> list[str]:
-    """Return the cells of a score in the table of scores, in the order of `score_headers`."""
+def make_score_cells(campaign: Campaign, score: Score) -> list[str]:
+    """Return the cells of a score in the table of scores, in the order of `make_score_headers`."""
     setting = campaign.settings[score.setting]
     return [
         *(str(setting.get(name, "")) for name in campaign.parameters),
@@ -192,7 +192,7 @@ def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
     with name_path_in_errors(path), partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["setting", *campaign.parameters, *(field.name for field in fields(Score)[1:])])
-        for score in summarize(store, campaign):
+        for score in compute_scores(store, campaign):
             setting = campaign.settings[score.setting]
             values = [setting.get(name, "") for name in campaign.parameters]
             writer.writerow(map(_format_cell, [score.setting, *values, *astuple(score)[1:]]))

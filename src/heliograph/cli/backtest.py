@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import choose_results_folder, measured_option, number, path_option
-from heliograph.cli.reading import ReadingOptions, read_measured
-from heliograph.files.stores.address import StoreAddress
+from heliograph.cli.app_and_option_types import choose_results_folder, integer_option, measured_option, path_option
+from heliograph.cli.measured_data import ReadingOptions, read_measured_plants
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from heliograph.files.recording import Recording
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import ResultsContent
     from heliograph.simulation.network import Network
 
 NAME = "backtest"
@@ -32,7 +32,10 @@ def backtest(
     horizons: Annotated[str, Parameter(help="Rows ahead, as 1,3,12.")] = "1,2,5,10",
     skip: Annotated[int, Parameter(help="Rows at the start from which nothing is forecast.")] = 10,
     refit: Annotated[
-        int, number("Rows between fits of the free numbers to the rows before; 0: the numbers of the file throughout.")
+        int,
+        integer_option(
+            "Rows between fits of the free numbers to the rows before; 0: the numbers of the file throughout."
+        ),
     ] = 0,
     reading: ReadingOptions | None = None,
 ) -> None:
@@ -47,9 +50,9 @@ def backtest(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.numerics.check import check_count, fail
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Check the options before anything is computed.
     target = choose_results_folder("backtest", out, NAME) / NAME
@@ -63,7 +66,9 @@ def backtest(
 
         advance("reading")
         loaded, module = load_module(network)
-        (data, *others) = read_measured(measurements, network, loaded, module, reading or ReadingOptions(), advance)
+        (data, *others) = read_measured_plants(
+            measurements, network, loaded, module, reading or ReadingOptions(), advance
+        )
         if others:
             raise fail("backtest", "data of one plant (--plant NAME)", f"{len(others) + 1} plants")
         advance(f"forecasting from {len(data.recording.time)} rows")
@@ -74,7 +79,7 @@ def backtest(
             loaded, z, rows_ahead, inputs=u, time=time, truth=truth, skip=skip, refit=fit_to_first, every=refit or 1
         )
 
-    def make_results(found: "heliograph.forecasting.Backtest") -> "Results":
+    def make_results(found: "heliograph.forecasting.Backtest") -> "ResultsContent":
         """Return the content of the results folder."""
         from heliograph.report.pages.backtest import make_backtest_results
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import path_option
-from heliograph.cli.worth import WorthOptions, compute_worth, describe_worth, write_figure
+from heliograph.cli.app_and_option_types import path_option
+from heliograph.cli.sensor_worth import WorthOptions, compute_worth, describe_worth, write_worth_figure
 
 DOUBTFUL = 1
 
@@ -47,7 +47,7 @@ def check(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
     from heliograph.simulation.description.doubts import doubts_before_data
@@ -55,9 +55,9 @@ def check(
     # What is asked of sensors is computed first, so that bad input prints nothing.
     loaded, module = load_module(network)
     options = WorthOptions(without or [], outage or [], added or [], inputs or [], steps, runs, figure)
-    if figure is not None and not options.asked:
+    if figure is not None and not options.is_asked:
         raise fail("--figure", "what sensors are worth (--without, --outage or --with)", "none of these")
-    worth = compute_worth(loaded, module, options) if options.asked else None
+    worth = compute_worth(loaded, module, options) if options.is_asked else None
     # The diagram, then a line for each doubt, of which only the serious ones count.
     print("\n".join(map(visible, loaded.diagram().splitlines())))
     doubts = doubts_before_data(loaded)
@@ -70,5 +70,5 @@ def check(
         print()
         for row in describe_worth(worth, steps, runs):
             print(visible(row))
-        write_figure(worth, options)
+        write_worth_figure(worth, options)
     return DOUBTFUL if serious else 0

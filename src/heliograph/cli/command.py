@@ -9,7 +9,7 @@ from typing import TextIO
 
 from cyclopts import CycloptsError
 
-from heliograph.cli.app import app, completion
+from heliograph.cli.app_and_option_types import app, completion
 from heliograph.cli.backtest import backtest
 from heliograph.cli.check import check
 from heliograph.cli.design import design
@@ -20,7 +20,7 @@ from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
-from heliograph.cli.stopping import INTERRUPTED, SIGNALLED, stoppable
+from heliograph.cli.stop_signals import INTERRUPTED, SIGNALLED, unwind_on_signals
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import explore, sweep
 from heliograph.numerics.process.optional_packages import EXTRAS, MissingPackagesError, how_to_install
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
     stopped: list[int] = []
     try:
-        with stoppable(stopped):
+        with unwind_on_signals(stopped):
             code = _run_command(arguments)
     except KeyboardInterrupt:
         return SIGNALLED + stopped[0] if stopped else INTERRUPTED
@@ -112,7 +112,7 @@ def _print_plain_warnings() -> Iterator[None]:
         ) -> None:  # fmt: skip
             """Print a warning to users as a line; leave others to Python."""
             if issubclass(category, UserWarning):
-                from heliograph.disk.quoting import visible
+                from heliograph.disk.quoted_text import visible
 
                 print(f"heliograph: warning: {visible(str(message))}", file=sys.stderr if file is None else file)
             else:
@@ -134,7 +134,7 @@ def _output_is_lost() -> bool:
 def _print_refusal(message: str) -> int:
     """Print an error as one line, and return the exit status of bad input."""
 
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
 
     print("heliograph:", visible(" ".join(message.split())), file=sys.stderr)
     return BAD_INPUT

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from heliograph.cli.app import choose_results_folder, path_option
+from heliograph.cli.app_and_option_types import choose_results_folder, path_option
 
 if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
     from heliograph.report.pages.design import DesignResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import ResultsContent
 
 NAME = "design"
 
@@ -27,19 +27,19 @@ def design(
     task:
         A TOML file that names the network, the budget or the target error, and what is free.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.design_file import read_design
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Read and check everything before the computation starts.
     target = choose_results_folder("design", out, NAME) / NAME
     file = read_design(task)
 
-    def results_of(designed: "DesignResults") -> "Results":
+    def results_of(designed: "DesignResults") -> "ResultsContent":
         """Return the content of the results folder."""
-        from heliograph.report.pages.design import design_results
+        from heliograph.report.pages.design import make_design_results
 
-        return design_results(designed)
+        return make_design_results(designed)
 
     designed = write_results(target, count_stages(file), lambda advance: compute_design(file, advance), results_of)
     best = designed.design
@@ -58,7 +58,7 @@ def count_stages(file: "DesignFile") -> int:
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
     import heliograph as hg
-    from heliograph.files.design_file import write_designed_source
+    from heliograph.files.design_file import make_designed_source
     from heliograph.planning.comparisons import totals_about
     from heliograph.report.pages.design import SOURCE, DesignResults
 
@@ -76,5 +76,5 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
         front=hg.planning.error_over_power(file.problem, totals, advance),
         changes=hg.planning.worth_of_changes(best, file.exponent, advance),
         map=None if sites is None else hg.planning.error_over_sites(best, sites.build, sites.x, sites.y, advance),
-        written=write_designed_source(file, SOURCE, best.powers),
+        written=make_designed_source(file, SOURCE, best.powers),
     )

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import path_option
+from heliograph.cli.app_and_option_types import path_option
 
 if TYPE_CHECKING:
-    from heliograph.export.c_files import Cost, Exported
+    from heliograph.export.c_files import Exported, StepCost
 
 
 def export(
@@ -37,9 +37,9 @@ def export(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.disk.quoting import visible
-    from heliograph.export.c_files import PRECISIONS, check_source_path, measure_cost, write_filter
-    from heliograph.export.text import find_claim
+    from heliograph.disk.quoted_text import visible
+    from heliograph.export.c_files import PRECISIONS, check_source_path, measure_step_cost, write_filter_files
+    from heliograph.export.c_text import find_claim_at_precision
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
 
@@ -47,10 +47,10 @@ def export(
     check_source_path(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
-    written = write_filter(named.filter, named.received, out, precision, apart, size, window)
+    written = write_filter_files(named.filter, named.received, out, precision, apart, size, window)
     exported, real = named.filter, PRECISIONS[precision]
-    measured = measure_cost(written.header, written.source, exported.received, len(exported.inputs), real)
-    claim = find_claim(exported, real)
+    measured = measure_step_cost(written.header, written.source, exported.received, len(exported.inputs), real)
+    claim = find_claim_at_precision(exported, real)
     print(visible(f"{written.header}, {written.source}: {named.place}/{filter} ({claim}), {precision} precision"))
     print("\n".join(describe_costs(written, measured)))
 
@@ -64,7 +64,7 @@ KINDS = {
 }
 
 
-def describe_costs(written: "Exported", measured: "Cost") -> list[str]:
+def describe_costs(written: "Exported", measured: "StepCost") -> list[str]:
     """Return two lines on the cost of a step: its operations by kind; bytes of state and code, and its time."""
     from heliograph.export.c_files import COMPILER
 

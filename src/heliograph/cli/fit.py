@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import measured_option, number, path_option
-from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured, take_only_plant
-from heliograph.cli.stopping import GentleStop
-from heliograph.files.stores.address import StoreAddress
+from heliograph.cli.app_and_option_types import integer_option, measured_option, path_option
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants, take_only_plant
+from heliograph.cli.stop_signals import GentleStop
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from heliograph.learning.losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Json, Results
+    from heliograph.report.results_folder import Json, ResultsContent
     from heliograph.simulation.network import Network
 
 STAGES = 6  # of the work, for the progress bar
@@ -36,8 +36,8 @@ def fit(
     *,
     measurements: Annotated[Path | StoreAddress, measured_option()],
     out: Annotated[Path, path_option("Folder of fitted.json, fitted_network.py, figures and page; made if missing.")],
-    starts: Annotated[int, number("From how many points to climb.")] = 6,
-    seed: Annotated[int, number("Seed of the starts.")] = 0,
+    starts: Annotated[int, integer_option("From how many points to climb.")] = 6,
+    seed: Annotated[int, integer_option("Seed of the starts.")] = 0,
     held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
     truth: Annotated[bool, Parameter(help="Learn from the true states (columns truth.STATE).", negative="")] = False,
     reading: ReadingOptions | None = None,
@@ -54,7 +54,7 @@ def fit(
         where it holds several. The name may be that of a function that returns one.
     """
     from heliograph.numerics.check import check_count, check_seed, scalar
-    from heliograph.report.results import write_results
+    from heliograph.report.results_folder import write_results
 
     # Check the options before the work starts.
     share = float(scalar("--held-out", held_out, 0.0, 0.9))
@@ -65,7 +65,9 @@ def fit(
 
         def work(advance: "Advance") -> "FitResults":
             """Learn with the options of the command."""
-            return learn(network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop)
+            return fit_and_judge(
+                network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop
+            )
 
         learned = write_results(out, STAGES, work, lambda learning: collect_results_files(learning, out, network))
         print(learned.fit)
@@ -76,7 +78,7 @@ def fit(
     return stop.code
 
 
-def learn(
+def fit_and_judge(
     network: str,
     measurements: Path | StoreAddress,
     starts: int,
@@ -87,7 +89,7 @@ def learn(
     reading: ReadingOptions,
     stop: GentleStop,
 ) -> "FitResults":
-    """Fit the free numbers to the earlier rows, and judge the filters on the later ones.
+    """Fit the free numbers to the earlier rows; return the fit with what the filters make of the later (held-out) ones.
 
     Args:
         network: the network as the user names it, FILE or FILE:NAME.
@@ -115,28 +117,30 @@ def learn(
     if has_deciding_sender(start):
         call = "hg.fit(hg.files.fitted.NetworkAgain(FILE), recording)"
         raise fail("network to be learned", f"no trigger of a node (in Python {call} learns it)", "one with a trigger")
-    data = _read_data(measurements, network, start, advance, truth, reading)
+    data = _read_rows_to_fit(measurements, network, start, advance, truth, reading)
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
     learned_rows = rows - int(held_out * rows)
     fitted = _fit_with_progress(build, recording, learned_rows, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
-    # How well the later rows were predicted before and after the fit; whether what was predicted then holds.
+    # How well each filter predicted the later rows before and after the fit (log-likelihood), and whether the fitted
+    # laws hold there: the probability integral transforms of those rows are uniform then.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
     changes: list[Change] = []
     uniform: list[Uniformity] = []
     if learned_rows < rows:
-        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
+        changes = stop.run_unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
     if changes:
-        uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
+        uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
+    # The law of lost messages, by node of which some were lost.
     advance("looking at losses")
-    losses = stop.unless_stopped(lambda: _learn_lossy(start, recording)) or {}
+    losses = stop.run_unless_stopped(lambda: _estimate_losses_by_node(start, recording)) or {}
     return FitResults(network, str(measurements), fitted, learned_rows, rows - learned_rows, changes, uniform, losses)
 
 
-def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
+def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
     from heliograph.learning.losses.losses import learn_losses
 
@@ -166,7 +170,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     return fates
 
 
-def _read_data(
+def _read_rows_to_fit(
     measurements: Path | StoreAddress,
     reference: str,
     network: "Network",
@@ -175,12 +179,14 @@ def _read_data(
     reading: ReadingOptions,
 ) -> MeasuredPlant:
     """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
 
     module = load_module(reference)[1]
-    data = take_only_plant(measurements, read_measured(measurements, reference, network, module, reading, advance))
+    data = take_only_plant(
+        measurements, read_measured_plants(measurements, reference, network, module, reading, advance)
+    )
     for line in data.warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
     for line in data.summary:
@@ -215,7 +221,7 @@ def _fit_with_progress(
     def show_progress(line: str) -> None:
         """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
         stop.raise_if_requested()
-        stop.only_note_next()  # from here on there is a best so far, which the next signal keeps
+        stop.note_next_signal_only()  # from here on there is a best so far, which the next signal keeps
         form, _, rest = line.partition(":")
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {rows} rows ({form})", int(step[1]) if step else STEPS, STEPS)
@@ -225,11 +231,11 @@ def _fit_with_progress(
     return fitted
 
 
-def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Results":
-    """Return the content of the results folder."""
+def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
+    """Return what goes into the results folder of a fit: figures, page, summary, network with the fitted numbers."""
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
-    from heliograph.report.results import Results
+    from heliograph.report.results_folder import ResultsContent
 
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
@@ -238,11 +244,11 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}
-    return Results(draw_fit_figures(learned), make_page_of_drawings(learned), summary, write)
+    return ResultsContent(draw_fit_figures(learned), make_page_of_drawings(learned), summary, write)
 
 
 def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
-    """Return filters before and after, and losses, for JSON."""
+    """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON."""
     # Each filter: gain of the log-likelihood per row, size and whiteness of its innovations.
     filters: list[Json] = [
         {
@@ -265,7 +271,7 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
             "best": loss.best,
             "memory_p": loss.memory.likelihood_p,
             "laws": {
-                name_of_law: {key: _convert_share(share) for key, share in law.shares().items()}
+                name_of_law: {key: _convert_share_to_json(share) for key, share in law.shares().items()}
                 for name_of_law, law in loss.laws.items()
             },
             "gains": {name_of_law: score.gain for name_of_law, score in loss.held_out.items()},
@@ -275,6 +281,6 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
     return {"filters": filters, "losses": losses}
 
 
-def _convert_share(share: "Share") -> "dict[str, Json]":
+def _convert_share_to_json(share: "Share") -> "dict[str, Json]":
     """Return a share and its interval by name; None if nothing was counted."""
     return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from heliograph.files.inspection import Topic
+    from heliograph.files.topic_inspection import TopicStatistics
 
 
 def inspect(
@@ -29,7 +29,7 @@ def inspect(
         JSON, a log, a table) or a folder of these, of which each is a topic, or the URL of a broker: mqtt://, nats://
         or opc.tcp://.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.source_suggestions import suggest_sources
     from heliograph.numerics.check import TINY, scalar
 
@@ -48,13 +48,13 @@ def inspect(
         print(f"heliograph: warning: {visible(broken)}", file=sys.stderr)
 
 
-def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, Topic], str]":
+def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[dict[str, TopicStatistics], str]":
     """Return the topics of files, or of a broker after listening to it for a while, and what is broken in the files."""
-    from heliograph.files.inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
-    from heliograph.files.logs.log import is_log
-    from heliograph.files.messages.folder import is_folder
-    from heliograph.files.messages.in_files import LINES
-    from heliograph.files.text.text_file import kind_of
+    from heliograph.files.logs.vehicle_log import is_log
+    from heliograph.files.messages.folder_of_message_files import is_message_folder
+    from heliograph.files.messages.message_files import LINES
+    from heliograph.files.text.text_file import find_extension
+    from heliograph.files.topic_inspection import inspect_bag, inspect_file, inspect_folder, inspect_log
     from heliograph.report.progress import progress
 
     with progress(2) as advance:
@@ -65,25 +65,25 @@ def _collect_topics(recording: str, seconds: float, dbc: Path | None) -> "tuple[
             advance(f"listening for {seconds:g} s")
             return listen(parse_address(recording), seconds), ""
         path = Path(recording)
-        if path.is_file() and kind_of(path) in (*LINES, ".csv", ".parquet"):
+        if path.is_file() and find_extension(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)
         if is_log(path):
             advance(f"reading {recording}")
             return inspect_log(path, dbc)
-        if is_folder(path):
+        if is_message_folder(path):
             advance(f"reading {recording}")
             return inspect_folder(path)
         return inspect_bag(path, lambda done, total: advance(f"reading {recording}", done, total))
 
 
-def _print_table(topics: "dict[str, Topic]") -> None:
+def _print_table(topics: "dict[str, TopicStatistics]") -> None:
     """Print a line for each topic: its messages, their rate and largest gap, and how late they come."""
     import rich.console
     import rich.markup
     import rich.table
 
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
 
     table = rich.table.Table(
         "topic", "type", "messages", "rate", "largest gap", "late (s): median, 95 %, most", box=None

@@ -4,15 +4,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
-from heliograph.cli.app import path_option
+from heliograph.cli.app_and_option_types import path_option
 
 TEMPLATE = "my_network.py.txt"  # no module of ours
 
 
 def new(file: Annotated[Path, path_option("Python file to write; it must not be there yet.")], /) -> None:
     """Write a commented network to begin with: a file that runs, and simulates data for itself."""
-    from heliograph.disk.quoting import visible
-    from heliograph.disk.whole_file import check_writable, whole_file
+    from heliograph.disk.atomic_files import check_writable, whole_file
+    from heliograph.disk.quoted_text import visible
     from heliograph.numerics.check import fail
 
     check_writable(file, (".py",))

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import measured_option, number, path_option
-from heliograph.cli.reading import ReadingOptions, open_measured, read_events, read_rows
-from heliograph.files.stores.address import StoreAddress
+from heliograph.cli.app_and_option_types import integer_option, measured_option, path_option
+from heliograph.cli.measured_data import ReadingOptions, open_path_or_store, read_events, read_rows
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from heliograph.files.stores.tables import StoreTable
+    from heliograph.files.stores.store_tables import StoreTable
     from heliograph.live.event import Event
 
 LONGEST = 1e6  # seconds that the system sleeps at once
@@ -38,7 +38,7 @@ def replay(
     delay: Annotated[float, Parameter(help="Mean time on the way, of an exponential law: messages overtake.")] = 0.0,
     duplicates: Annotated[float, Parameter(help="Probability that a message arrives twice.")] = 0.0,
     trace: Annotated[Path | None, path_option("CSV of a recorded link, one delay a message, nan if lost.")] = None,
-    seed: Annotated[int, number("Seed of what happens on the way.")] = 0,
+    seed: Annotated[int, integer_option("Seed of what happens on the way.")] = 0,
     strict: Annotated[
         bool, Parameter(help="Stop at the first message or row that cannot be read.", negative="")
     ] = False,
@@ -62,7 +62,7 @@ def replay(
     options = ReadingOptions(strict=strict, ignore_unknown=ignore_unknown)
     # Of each plant of the recording the messages that arrive through the link: (arrival, line), by arrival.
     messages_of_plants = []
-    for i, (name, events, origin) in enumerate(_read_events(recording, network, options)):
+    for i, (name, events, origin) in enumerate(_yield_events_of_plants(recording, network, options)):
         received = simulate_link(events, link, seed + i) if trace is None else delay_as_traced(events, trace)
         messages_of_plants.append(encode_messages(received, name if plant is None else plant, origin))
     # Print each line when it is due: as long after the first as it arrived, by `speed` sooner.
@@ -78,19 +78,19 @@ def replay(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _read_events(
+def _yield_events_of_plants(
     location: Path | StoreAddress, reference: str, options: ReadingOptions
 ) -> "Iterator[tuple[str, list[Event], np.datetime64 | None]]":
     """Yield name, events and date of time 0 of each plant; the date is None where times are no dates.
 
     A recording has events, or rows of time, which are those of one plant. Warnings and notes go to the standard error.
     """
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.serving.brokers.replay import events_of_recording
 
     network, module = load_module(reference)
-    path = open_measured(location)
+    path = open_path_or_store(location)
 
     def no_progress(what: str, done: int = 0, total: int = 0) -> None:
         """Show nothing: the standard output is a pipe."""
@@ -98,19 +98,19 @@ def _read_events(
     table = read_events(path, reference, network, module, options, no_progress)
     if table is None:  # rows of time
         rows = read_rows(path, network, options)
-        for line in [*rows.warnings, *_describe_finer(path, rows.recording.time)]:
+        for line in [*rows.warnings, *_describe_too_fine_dates(path, rows.recording.time)]:
             print(f"heliograph: {visible(line)}", file=sys.stderr)
         yield ("", *events_of_recording(rows.recording, network))
         return
     import numpy as np
 
-    from heliograph.cli.reading import describe_unread
+    from heliograph.cli.measured_data import describe_unreadable_messages
 
     lines_on_digits: list[str] = []
     if table.dated:
         times = [columns.time for name in table.plants for columns in table.of(name).columns.values()]
-        lines_on_digits = _describe_finer(path, np.concatenate(times).astype("datetime64[ns]"))
-    for line in [*describe_unread(path, table), *table.notes, *lines_on_digits]:
+        lines_on_digits = _describe_too_fine_dates(path, np.concatenate(times).astype("datetime64[ns]"))
+    for line in [*describe_unreadable_messages(path, table), *table.notes, *lines_on_digits]:
         print(f"heliograph: {visible(line)}", file=sys.stderr)
     for name in table.plants:
         events = table.of(name)
@@ -118,8 +118,8 @@ def _read_events(
         yield name, list(events.sort_events()), events.date if has_dates else None
 
 
-def _describe_finer(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
-    """Say how many dates are finer than the microseconds that messages have; nothing if none is."""
+def _describe_too_fine_dates(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
+    """Return a line on how many dates are finer than the microseconds that messages have; [] if none is."""
     if time.dtype.kind != "M":
         return []
     finer = int((time != time.astype("datetime64[us]")).sum())

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.filtered_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
-from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
-from heliograph.cli.reading import MeasuredPlant, ReadingOptions, read_measured
-from heliograph.files.stores.address import StoreAddress
+from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
+from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
+from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -80,7 +80,7 @@ def run(
         if not any(loaded.claims().values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
-        said_of_blocks: SaidOfBlocks | None = None  # of a long table, which is not read as a whole but in blocks
+        said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
         measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)
@@ -89,7 +89,7 @@ def run(
         for data in measured:
             advance(f"filtering {len(data.recording.time)} rows")
             plant = filter_plant(loaded, data, smoother, horizons, predicted)
-            place = out and place_of_plant(out, data.plant, several=len(measured) > 1)
+            place = out and choose_output_of_plant(out, data.plant, several=len(measured) > 1)
             if place is not None:
                 advance(f"writing {place}")
                 plant.said.extend(write_plant_estimates(plant, place, loaded, module, lag, options))
@@ -114,7 +114,7 @@ def _read_plants(
     """Return what was measured of each plant; raise ValueError if a lag is asked for of rows of time."""
     from heliograph.numerics.check import fail
 
-    measured = read_measured(measurements, reference, network, module, options, advance)
+    measured = read_measured_plants(measurements, reference, network, module, options, advance)
     if lag is not None and measured[0].events is None:
         raise fail("--lag", "messages or events", f"rows of time in {measurements}")
     return measured
@@ -137,7 +137,7 @@ def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
 def _print_lines(warnings: list[str], summary: list[str]) -> None:
     """Print warnings to the standard error, and the summary to the standard output."""
 
-    from heliograph.disk.quoting import visible
+    from heliograph.disk.quoted_text import visible
 
     for line in warnings:
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
@@ -177,18 +177,18 @@ def _check_options(
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
     """Return a line on what was written where, and one on the errors of each filter."""
-    written = WrittenRows()
+    written = WrittenRowCounts()
     written.add(record)
     places = [path for path in (out, report and report / "report.html") if path is not None]
-    return [written.describe(*places), *_describe_errors(record)]
+    return [written.describe(*places), *_describe_estimation_errors(record)]
 
 
-def _describe_errors(record: "Record") -> list[str]:
+def _describe_estimation_errors(record: "Record") -> list[str]:
     """Return a line on the errors of each filter if the truth is known: RMSE by state, and NEES (1: claim holds)."""
-    from heliograph.report.outputs import compare_with_truth, round_to
+    from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
-    for errors in compare_with_truth(record):
+    for errors in compute_filter_errors(record):
         parts = [f"of {state} {round_to(value, errors.rmse_error[state])}" for state, value in errors.rmse.items()]
         nees = "" if isnan(errors.nees) else f"; NEES per state {errors.nees:.3g}"
         lines.append(f"{errors.node}/{errors.filter}: RMSE {', '.join(parts)}{nees}")
@@ -199,11 +199,11 @@ def _check_output_places(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, report: Path | None
 ) -> None:
     """Check before the work starts that packages for these files are installed, and that they can be written."""
-    from heliograph.disk.whole_file import FORMATS, check_writable
-    from heliograph.files.logs.log import PACKAGES
+    from heliograph.disk.atomic_files import FORMATS, check_writable
+    from heliograph.files.logs.vehicle_log import PACKAGES
     from heliograph.numerics.check import fail
-    from heliograph.numerics.process.optional_packages import check_installed
-    from heliograph.report.results import NEEDS
+    from heliograph.numerics.process.extras import check_installed
+    from heliograph.report.results_folder import NEEDS
 
     endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}
     needed = [package for ending in endings & PACKAGES.keys() for package in PACKAGES[ending]]
@@ -213,7 +213,7 @@ def _check_output_places(
         needed.append("pyarrow")
     check_installed([*needed, *(NEEDS if report is not None else ())])
     if isinstance(out, StoreAddress):
-        from heliograph.files.stores.tables import check_store
+        from heliograph.files.stores.store_tables import check_store
 
         check_store(out)
     elif out is not None:
@@ -221,8 +221,8 @@ def _check_output_places(
         if isinstance(measurements, Path) and out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.disk.whole_file import check_replaceable
-        from heliograph.report.results import SUMMARY
+        from heliograph.disk.atomic_files import check_replaceable
+        from heliograph.report.results_folder import SUMMARY
 
         check_replaceable(report, SUMMARY)
 
@@ -231,11 +231,15 @@ def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
     """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
-    from heliograph.files.messages.folder import is_folder, list_used_files
+    from heliograph.files.messages.folder_of_message_files import is_message_folder, list_used_files
     from heliograph.files.sources.sources import Sources
     from heliograph.numerics.check import fail
 
-    if sources is None or not isinstance(out, Path) or not (isinstance(measurements, Path) and is_folder(measurements)):
+    if (
+        sources is None
+        or not isinstance(out, Path)
+        or not (isinstance(measurements, Path) and is_message_folder(measurements))
+    ):
         return
     if out.resolve() in [file.resolve() for file in list_used_files(measurements, Sources(sources, network))]:
         raise fail(f"output file {out}", "another file than the measurements", "one of them")
@@ -245,8 +249,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     """Examine the records of all plants and write the report, a page for each plant and one of all."""
     from dataclasses import replace
 
-    from heliograph.report.health import Health, examine
-    from heliograph.report.results import Results, write_results
+    from heliograph.report.recording_diagnosis import Health, examine
+    from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
         """Return the diagnosis of a plant, with its forecasts and residuals."""
@@ -262,7 +266,7 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
         """Return the diagnosis of each plant, by name."""
         return {plant.data.plant: examine_plant(plant, advance) for plant in plants}
 
-    def results_of(health: dict[str, Health]) -> Results:
+    def results_of(health: dict[str, Health]) -> ResultsContent:
         """Return the content of the results folder: of one plant its page, of several an overview and folders."""
         from heliograph.report.pages.run import make_results_of_plants, make_run_results
 

@@ -101,11 +101,11 @@ class ServeOptions:
             every=self.every,
             forecast=horizons_in(self.forecast) if self.forecast else None,
             thresholds=tuple(map(parse_threshold, self.threshold or ())),
-            states=self._read_states(),
+            states=self._make_state_topics(),
         )
         return settings if self.node is None else settings_of_node(settings, self.node)
 
-    def _read_states(self) -> "StateTopics | None":
+    def _make_state_topics(self) -> "StateTopics | None":
         """Return the topics under which single states are published, by --states and --discovery; None without.
 
         Raises:

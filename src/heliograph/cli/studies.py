@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol
 
 from cyclopts import Parameter
 
-from heliograph.cli.app import choose_results_folder, number, path_option
+from heliograph.cli.app_and_option_types import choose_results_folder, integer_option, path_option
 
 GROUP = "heliograph.studies"
 PAGES = {  # what is a page of the documentation, with blocks that run, by the name of the example that it was
@@ -46,7 +46,7 @@ class Study(Protocol):
 def demo(
     *,
     out: Annotated[Path, path_option("Folder for the estimates, figures, report and summary; made if missing.")],
-    seed: Annotated[int | None, number("Seed of the simulated relays; 0 unless given.")] = None,
+    seed: Annotated[int | None, integer_option("Seed of the simulated relays; 0 unless given.")] = None,
     recording: Annotated[str | None, Parameter(help="Which drive: plaza1, or plaza2 unless given.")] = None,
     changes: Changes | None = None,
 ) -> None:
@@ -59,14 +59,14 @@ def example(
     /,
     *,
     out: Annotated[Path | None, path_option("Folder for the example's own, with report and summary.")] = None,
-    seed: Annotated[int | None, number("Seed of what is simulated; 0 unless given.")] = None,
+    seed: Annotated[int | None, integer_option("Seed of what is simulated; 0 unless given.")] = None,
     trace: Annotated[Path | None, path_option("Log of a radio network, for an example that takes one.")] = None,
     recording: Annotated[Path | None, path_option("Folder of a recording, for an example that takes one.")] = None,
     changes: Changes | None = None,
 ) -> None:
     """Run an example and report, or list them."""
     if name is None:
-        return print_list("example")
+        return print_studies("example")
     run_studies([name], out, collect_changes(changes, seed=seed, trace=trace, recording=recording), "example")
 
 
@@ -75,13 +75,13 @@ def reproduce(
     /,
     *,
     out: Annotated[Path | None, path_option("Folder for figures, report, record and summary.")] = None,
-    runs: Annotated[int | None, number("Monte Carlo runs; each publication has its own default.")] = None,
-    seed: Annotated[int | None, number("Seed of the simulations; 0 unless given.")] = None,
+    runs: Annotated[int | None, integer_option("Monte Carlo runs; each publication has its own default.")] = None,
+    seed: Annotated[int | None, integer_option("Seed of the simulations; 0 unless given.")] = None,
     changes: Changes | None = None,
 ) -> None:
     """Run a published method as printed and as improved, and judge each of its statements by this very run."""
     if method is None:
-        return print_list("publication")
+        return print_studies("publication")
     from heliograph.numerics.check import fail
 
     if method == "all" and changes:
@@ -106,8 +106,8 @@ def run_studies(
     Raises:
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
-    from heliograph.numerics.process.optional_packages import check_installed
-    from heliograph.report.results import NEEDS
+    from heliograph.numerics.process.extras import check_installed
+    from heliograph.report.results_folder import NEEDS
 
     known = list_studies(kind)
     _check_names(names, known, kind)
@@ -115,7 +115,7 @@ def run_studies(
     target = choose_results_folder(
         "reproduce" if kind == "publication" else kind, out, names[0] if own_folder is None else own_folder
     )
-    studies = {name: load(known[name]) for name in names}
+    studies = {name: load_study(known[name]) for name in names}
     # All settings are checked before any work.
     settings = {name: change_settings(name, study, values, kind) for name, study in studies.items()}
     import jax
@@ -198,21 +198,21 @@ def list_studies(kind: str) -> dict[str, EntryPoint]:
     return {name: entry for name, entry in offered.items() if entry.attr == kind}
 
 
-def load(entry: EntryPoint) -> Study:
+def load_study(entry: EntryPoint) -> Study:
     """Load the study of an entry point."""
     study: Study = entry.load()
     return study
 
 
-def print_list(kind: str) -> None:
+def print_studies(kind: str) -> None:
     """Print the studies of a kind, with the first line of each docstring."""
     known = list_studies(kind)
     width = max(map(len, known), default=0)
     for name, entry in known.items():
-        print(f"{name:{width}}  {first_line(entry.module)}")
+        print(f"{name:{width}}  {read_first_docstring_line(entry.module)}")
 
 
-def first_line(module: str) -> str:
+def read_first_docstring_line(module: str) -> str:
     """Return the first line of a module's docstring, without running the module."""
     return (ast.get_docstring(parse_source(module)) or "").partition("\n")[0]
 

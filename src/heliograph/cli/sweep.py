@@ -6,7 +6,7 @@ from typing import Annotated
 import rich.console
 from cyclopts import Parameter
 
-from heliograph.cli.app import number, path_option
+from heliograph.cli.app_and_option_types import integer_option, path_option
 
 
 def sweep(
@@ -14,10 +14,10 @@ def sweep(
     /,
     *,
     out: Annotated[Path, path_option("Folder for the results; what is already there is not computed again.")],
-    workers: Annotated[int | None, number("Processes here; 0: this one; by default one a CPU.")] = None,
+    workers: Annotated[int | None, integer_option("Processes here; 0: this one; by default one a CPU.")] = None,
     scheduler: Annotated[str | None, Parameter(help="Address of a Dask scheduler to work on instead.")] = None,
-    setting: Annotated[int | None, number("Run only this setting, here in one process.")] = None,
-    chunk: Annotated[int | None, number("And of it only this chunk.")] = None,
+    setting: Annotated[int | None, integer_option("Run only this setting, here in one process.")] = None,
+    chunk: Annotated[int | None, integer_option("And of it only this chunk.")] = None,
 ) -> int:
     """Simulate a network in many settings, into one labelled store that survives any interruption.
 
@@ -26,7 +26,7 @@ def sweep(
     campaign:
         A TOML file that names the network's function, the settings, and how many runs of each.
     """
-    from heliograph.campaign.command import sweep
+    from heliograph.campaign.sweep_command import sweep
 
     return sweep(campaign, out, workers, scheduler, setting, chunk)
 
@@ -38,9 +38,9 @@ def explore(
     out: Annotated[Path, path_option("Folder for explore.html.")],
 ) -> None:
     """Make one page of a campaign's results, to choose axes, settings, nodes and filters in; it works offline."""
-    from heliograph.campaign.explore import write_explorer
-    from heliograph.disk.whole_file import check_folder_writable
+    from heliograph.campaign.explore_page import write_explore_page_file
+    from heliograph.disk.atomic_files import check_folder_writable
 
     check_folder_writable(out)
-    page = write_explorer(results, out)
+    page = write_explore_page_file(results, out)
     rich.console.Console().print(f"Page: {page}", soft_wrap=True, highlight=False, markup=False)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
-from heliograph.disk.whole_file import check_writable, whole_files
-from heliograph.export.program import RESERVED, Real, write_step_program
-from heliograph.export.text import CText, TextOptions, write_c_text
-from heliograph.export.window import check_window
+from heliograph.disk.atomic_files import check_writable, whole_files
+from heliograph.export.c_text import CText, CTextOptions, generate_header_and_source
+from heliograph.export.late_measurement_window import check_and_count_window_steps
+from heliograph.export.step_program import RESERVED, Real, lower_step_to_c_functions
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.over_time import first
@@ -87,12 +87,12 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
+        return write_filter_files(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
+    return write_filter_files(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
     return outputs if len(outputs) == filter.received else tuple(f"z{i}" for i in range(filter.received))
 
 
-def write_filter(
+def write_filter_files(
     filter: AbstractFilter,
     received: Sequence[str],
     path: str | Path,
@@ -114,8 +114,8 @@ def write_filter(
     source = check_source_path(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
-    late = None if window is None else check_window(filter, window)
-    text = make_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
+    late = None if window is None else check_and_count_window_steps(filter, window)
+    text = make_c_text(filter, received, source.stem, PRECISIONS[precision], apart=apart, size=size, late=late)
     header = source.with_suffix(".h")
     with whole_files([header, source]) as partials:
         for partial, content in zip(partials, (text.header, text.source), strict=True):
@@ -140,7 +140,7 @@ def check_source_path(path: str | Path) -> Path:
     return source
 
 
-def make_text(
+def make_c_text(
     filter: AbstractFilter,
     received: Sequence[str],
     prefix: str,
@@ -163,55 +163,57 @@ def make_text(
     Raises:
         ValueError: single precision for a filter that cannot keep its covariance in it; a number that is beyond it.
     """
-    if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_factors(filter)):
+    if real == "float" and not (isinstance(filter, ScheduledFilter) or carries_covariance_factors(filter)):
         expected = "a filter that carries its covariance as factors L D L', or a schedule of gains"
         raise fail("single precision", expected, type(filter).__name__)
     exported = filter if real == "double" else filter.for_single_precision()
     precision, dtype = ("double", np.float64) if real == "double" else ("single", np.float32)
     kind = f"a {type(filter).__name__} in {precision} precision"
-    form = TextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
+    form = CTextOptions(prefix=prefix, real=real, received=received, kind=kind, late=late)
     # Loops are not always shorter than what they repeat: for a short source both forms are written.
     forms = (True, False) if size else (False,)
     texts = list[CText]()
     try:
         for in_loops in forms:
             with use_precision(dtype), write_short_programs(in_loops):
-                program = write_step_program(exported, real, prefix, apart, in_loops)
-            texts.append(write_c_text(program, form))
+                program = lower_step_to_c_functions(exported, real, prefix, apart, in_loops)
+            texts.append(generate_header_and_source(program, form))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision
     return min(texts, key=lambda text: len(text.source))
 
 
-def carries_factors(filter: AbstractFilter) -> bool:
+def carries_covariance_factors(filter: AbstractFilter) -> bool:
     """Return whether the state has variances of L D L', which stay positive in any precision, and no covariance."""
     return any(keystr(path).endswith(".variances") for path, _ in tree_flatten_with_path(filter.init())[0])
 
 
-class Cost(NamedTuple):
+class StepCost(NamedTuple):
     """Bytes of code and constants, and nanoseconds of a step, the fastest of five rounds; None if not measured."""
 
     code_bytes: int | None
     nanoseconds: float | None
 
 
-def measure_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> Cost:
+def measure_step_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
     """Return the bytes of code and the time of a step, compiled in a temporary folder."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
-        return Cost(None, None)
+        return StepCost(None, None)
     with tempfile.TemporaryDirectory() as temporary:
         folder, name = Path(temporary), source.stem
         for path in (header, source):
             shutil.copy(path, folder)
-        (folder / "main.c").write_text(_write_timer(name, received, inputs, real), encoding="utf-8")
+        (folder / "main.c").write_text(_generate_timer_program(name, received, inputs, real), encoding="utf-8")
         _run_command(compiler, *FLAGS, "-c", source.name, "-o", "step.o", folder=folder)
         timer = ["-D_POSIX_C_SOURCE=199309L", *FLAGS, "main.c", "step.o", "-lm", "-o", "timer"]
         _run_command(compiler, *timer, folder=folder)
-        return Cost(_measure_code(folder), nanoseconds=float(_run_command(str(folder / "timer"), folder=folder)))
+        return StepCost(
+            _measure_code_size(folder), nanoseconds=float(_run_command(str(folder / "timer"), folder=folder))
+        )
 
 
-def _measure_code(folder: Path) -> int | None:
+def _measure_code_size(folder: Path) -> int | None:
     """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None
@@ -226,7 +228,7 @@ def _run_command(*command: str, folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def _write_timer(name: str, received: int, inputs: int, real: Real) -> str:
+def _generate_timer_program(name: str, received: int, inputs: int, real: Real) -> str:
     """Return a C program that prints the nanoseconds of a step, by the fastest of REPEATS rounds of STEPS steps.
 
     Where a step is refused, as past the end of a schedule, it starts again.

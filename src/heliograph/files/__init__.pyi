@@ -1,17 +1,17 @@
 """Public names of the room; the package loads them when first used."""
 
-from .availability import (
+from .device_availability import (
     Available as Available,
 )
-from .bags.output import (
+from .bags.estimates_writer import (
     Pose as Pose,
 )
-from .sources.derived import (
+from .sources.computed_values import (
     Covariance as Covariance,
     Geodetic as Geodetic,
     Yaw as Yaw,
 )
-from .estimates.table import (
+from .estimates.estimates_table import (
     write_estimates as write_estimates,
 )
 from .event_table import (
@@ -20,7 +20,7 @@ from .event_table import (
 from .fitted import (
     load_fitted as load_fitted,
 )
-from .estimates.forecasts import (
+from .estimates.forecasts_table import (
     write_forecast as write_forecast,
 )
 from .sources.json_field import (
@@ -38,7 +38,7 @@ from .sources.lorawan import (
     chirpstack as chirpstack,
     the_things_stack as the_things_stack,
 )
-from .messages.to_events import (
+from .messages.messages_to_events import (
     read_messages as read_messages,
 )
 from .network_file import (
@@ -49,10 +49,10 @@ from .recording import (
     read_recording as read_recording,
     write_recording as write_recording,
 )
-from .sources.reading import (
+from .sources.node_reading import (
     Reading as Reading,
 )
-from .stores.tables import (
+from .stores.store_tables import (
     read_store as read_store,
     store_estimates as store_estimates,
 )

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.rows import EXACT, Rows
+from heliograph.files.table_rows import EXACT, TableRows
+from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import CsvReader, CsvRow, parse_cell
-from heliograph.files.text.dialects import NO_VALUE
-from heliograph.files.text.plain_numbers import parse_plain_lines
+from heliograph.files.text.numeric_csv_lines import parse_numeric_lines
 from heliograph.files.text.text_file import CutOffError, Progress, read_line_blocks, split_lines, yield_until_cut_off
 from heliograph.numerics.check import InputError, fail, show_value
 from heliograph.numerics.times.dates import MISSING as NAT
@@ -21,7 +21,7 @@ WHOLE = re.compile(r"[+-]?\d{1,18}|[+-]?[1-8]\d{18}")  # numbers that 64 bits ho
 
 def read_csv_blocks(
     path: Path, only: Container[str] | None, strict: bool, size: int, progress: Progress | None = None
-) -> Iterator[Rows]:
+) -> Iterator[TableRows]:
     """Yield the rows of a CSV file in parts, each of about `size` bytes of lines, and why others cannot be read.
 
     Args:
@@ -37,11 +37,11 @@ def read_csv_blocks(
     text, columns = CsvReader(str(path), path, marked=False), CsvColumnReader(str(path), path, only, strict)
     blocks = read_line_blocks(path, size, progress)
     for lines in blocks if strict else yield_until_cut_off(blocks):
-        yield columns.read([lines]) if isinstance(lines, CutOffError) else _read_lines(text, columns, lines)
+        yield columns.read([lines]) if isinstance(lines, CutOffError) else _read_csv_lines(text, columns, lines)
     yield columns.read(text.end())
 
 
-def _read_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> Rows:
+def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:
     """Return the rows of some lines: all at once where they are plain, else by their cells, which say what is wrong."""
     # Line by line until the header, with the names of the columns, has come.
     rows, begin = list[CsvRow | InputError](), 0
@@ -51,10 +51,10 @@ def _read_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> Ro
         begin = end
     rest = lines[begin:] if begin else lines
     if not rows and text.header and not text.is_open:
-        numbers = parse_plain_lines(rest, len(text.header))
-        if numbers is not None and columns.accepts_plain(text.header, numbers):
+        numbers = parse_numeric_lines(rest, len(text.header))
+        if numbers is not None and columns.accepts_numbers(text.header, numbers):
             text.number += len(numbers)
-            return columns.take_plain(text.header, numbers, text.number - len(numbers) + 1)
+            return columns.make_rows_of_numbers(text.header, numbers, text.number - len(numbers) + 1)
     return columns.read([*rows, *(row for line in split_lines(rest) for row in text.add(line))])
 
 
@@ -74,7 +74,7 @@ class CsvColumnReader:
         self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
         self._zoned = dict[str, bool]()  # whether these have a zone
 
-    def read(self, rows: Iterable[CsvRow | InputError]) -> Rows:
+    def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
         """Return the rows that can be read, as columns; why the others cannot.
 
         Raises:
@@ -100,16 +100,18 @@ class CsvColumnReader:
         for i, name in enumerate(self.header):
             if self._only is None or name in self._only:
                 columns[name] = self._make_column(name, [row[i] for row in values], [cells[i] for cells in texts])
-        return Rows(columns, np.array(numbers, dtype=np.int64), refused)
+        return TableRows(columns, np.array(numbers, dtype=np.int64), refused)
 
-    def accepts_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
+    def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
         """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles."""
         if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
             return False
         dated = [i for i, name in enumerate(header) if self._dated.get(name)]
         return bool(np.isnan(numbers[:, dated]).all())
 
-    def take_plain(self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int) -> Rows:
+    def make_rows_of_numbers(
+        self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int
+    ) -> TableRows:
         """Return numbers under this header as rows, the number of whose first one is `first`."""
         self.header, columns = header, dict[str, np.ndarray]()
         for name, values in zip(header, numbers.T, strict=True):
@@ -121,7 +123,7 @@ class CsvColumnReader:
             columns[name] = values.copy()
             if name not in self._dated and not np.isnan(values).all():
                 self._dated[name] = False
-        return Rows(columns, np.arange(first, first + len(numbers)), [])
+        return TableRows(columns, np.arange(first, first + len(numbers)), [])
 
     def _check_header(self, row: CsvRow) -> None:
         """Raise if a row stands under another header than the rows before it."""
@@ -144,7 +146,7 @@ class CsvColumnReader:
                 continue
             has_dates = self._dated.get(name)  # None: not decided yet
             if (looks_like_date(cell) if has_dates is None else has_dates) and not self._is_missing(cell):
-                numbers.append(self._read_moment(row, name, cell))
+                numbers.append(self._parse_date(row, name, cell))
                 newly_dated[name] = True
             elif has_dates:
                 numbers.append(NAT)
@@ -160,7 +162,7 @@ class CsvColumnReader:
         """Return whether a cell is empty, or says that there is no value."""
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
-    def _read_moment(self, row: CsvRow, name: str, cell: str) -> int:
+    def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
         """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)

@@ -55,9 +55,9 @@ def read_design(path: Path) -> DesignFile:
     table = _read_toml(path)
     file, name = _find_python_file(path, table.get("network"), "network")
     # What is designed, and the further results that are asked for: front, exponent of the path loss, map.
-    free = _read_free(path, table)
+    free = _read_free_transmitters(path, table)
     network = load_network(f"{file}:{name}" if name else str(file))
-    problem = _read_problem(path, table, network, free)
+    problem = _read_design_problem(path, table, network, free)
     front = table.get("front")
     return DesignFile(
         reference=f"{file.name}:{name}" if name else file.name,
@@ -66,7 +66,7 @@ def read_design(path: Path) -> DesignFile:
         problem=problem,
         front=None if front is None else tuple(array(f"{path.name}, front", front, (None,)).tolist()),
         exponent=_read_number(path, table, "path_loss_exponent"),
-        map=_read_map(path, table) if "map" in table else None,
+        map=_read_map_places(path, table) if "map" in table else None,
     )
 
 
@@ -85,7 +85,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     return table
 
 
-def _read_free(path: Path, table: Mapping[str, Any]) -> tuple[str, ...] | None:
+def _read_free_transmitters(path: Path, table: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return the names of the transmitters whose powers are free; None where the design file does not say it."""
     free = table.get("free")
     if free is None:
@@ -95,7 +95,7 @@ def _read_free(path: Path, table: Mapping[str, Any]) -> tuple[str, ...] | None:
     return tuple(free)
 
 
-def _read_problem(
+def _read_design_problem(
     path: Path, table: Mapping[str, Any], network: Network, free: tuple[str, ...] | None
 ) -> DesignProblem:
     """Return the design problem of a network as the content `table` of the design file `path` states it."""
@@ -123,7 +123,7 @@ def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
     return Budget(**value) if isinstance(value, dict) else Budget(scalar(f"{path.name}, budget", value, 0.0))
 
 
-def _read_map(path: Path, table: Mapping[str, object]) -> MapPlaces:
+def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
     """Return the places of the map that a design file asks for: the network's function of x and y, and the grid."""
     values = _read_table(path, table, "map")
     file, name = _find_python_file(path, values.get("network"), "map.network")
@@ -165,7 +165,7 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
             raise fail(f"{where}, key {key!r}", f"one of {', '.join(known)}", f"an unknown key{hint}")
 
 
-def write_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
+def make_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
     """Return Python source of a designed network, which loads the original from a file in its own folder.
 
     Args:

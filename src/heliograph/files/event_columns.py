@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.files.sources.reading import Unread
+from heliograph.files.sources.node_reading import Unread
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
 from heliograph.model.checks.refusal_reasons import Reason, RefusedError
@@ -22,7 +22,7 @@ USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicat
 FEWEST_FALLS = 3  # of a count from one number, before that is taken for its largest
 
 
-class UnsetStamps(NamedTuple):
+class UnsetStampNotes(NamedTuple):
     """What is said of stamps that were not set."""
 
     note: str = ""  # on the clock
@@ -62,12 +62,12 @@ class NodeEvents:
 
     def keep_events(self, which: np.ndarray) -> None:
         """Keep only the events of the mask `which`, (events,)."""
-        columns, matrix = self.arrays(), self.matrix()[which]
+        columns, matrix = self.arrays(), self.value_matrix()[which]
         # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
         self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c[which]) for c in columns)
         self.values = array("d", matrix.ravel())
 
-    def matrix(self) -> Float[np.ndarray, "events size"]:
+    def value_matrix(self) -> Float[np.ndarray, "events size"]:
         """Return the values, a row for each event."""
         return np.array(self.values).reshape(len(self.time), self.size)
 
@@ -94,9 +94,9 @@ class NodeEvents:
             return None
         moments = np.array([moment for moment, _ in self.unread], dtype=time.dtype)
         counts = np.array([count for _, count in self.unread], dtype=np.int64)
-        return count_gaps(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
+        return count_missing_messages(np.concatenate([time, moments]), np.concatenate([sequence, counts]), self.period)
 
-    def fill_losses(
+    def write_losses_before_events(
         self, table: Float[np.ndarray, "rows received"], rows: np.ndarray, counts: Int[np.ndarray, " events"]
     ) -> None:
         """Write how many messages were lost before each event into the last column of the node's `table`.
@@ -143,7 +143,7 @@ class NodeEvents:
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
-    def drop_unset_stamps_in_place(self, name: str) -> UnsetStamps:
+    def drop_unset_stamps_in_place(self, name: str) -> UnsetStampNotes:
         """Remove the events whose stamps were not set; return what is to be said of that. `name`: of the node.
 
         A stamp that is more than a year before its arrival was not set. Where most are, stamps and arrivals are of two
@@ -153,24 +153,24 @@ class NodeEvents:
         time, arrival, _ = self.arrays()
         delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds
         if not len(time):
-            return UnsetStamps()
+            return UnsetStampNotes()
         if np.median(delays) > year:
             self.arrival = array(self.time.typecode, self.time)
             two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"
-            return UnsetStamps(note=f"{name}: {two_clocks}")
+            return UnsetStampNotes(note=f"{name}: {two_clocks}")
         # Where arrivals are not known each is the event's own time.
         are_arrivals_known = bool(delays.any())
         unset = delays > year if are_arrivals_known else find_unset_stamps(time, year)
         count = int(np.count_nonzero(unset))
         if not count:
-            return UnsetStamps()
+            return UnsetStampNotes()
         self._note_unset(unset, are_arrivals_known)
         first = time[np.argmax(unset)]
         moment = f"{first:.10g}" if self.numbers else str(np.datetime64(int(first), "ns"))
         near = "that of arrival" if are_arrivals_known else "the others in order"
         why = fail(name, f"a time that was set, near {near}", f"{moment} in {count} of {len(time)} messages")
         self.keep_events(~unset)
-        return UnsetStamps(reason=str(why), removed=count)
+        return UnsetStampNotes(reason=str(why), removed=count)
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
         """Note events with unset stamps as messages that came and are no events: moments near them, and counts.
@@ -185,7 +185,7 @@ class NodeEvents:
         self.unread += zip(moments[unset].tolist(), sequence[unset].tolist(), strict=True)
 
 
-class ArrivedEvents(NamedTuple):
+class EventsByArrival(NamedTuple):
     """Events in order of arrival, (events,) each: node (-1: inputs), time, arrival, count, index among its node's."""
 
     node: np.ndarray
@@ -194,13 +194,13 @@ class ArrivedEvents(NamedTuple):
     sequence: np.ndarray
     place: np.ndarray
 
-    def of(self, which: np.ndarray) -> "ArrivedEvents":
+    def select(self, which: np.ndarray) -> "EventsByArrival":
         """Return some of the events, by number or by mask."""
-        return ArrivedEvents(*(column[which] for column in self))
+        return EventsByArrival(*(column[which] for column in self))
 
 
 def judge_events(
-    events: ArrivedEvents,
+    events: EventsByArrival,
     values: Callable[[int], np.ndarray],
     joint: bool,
     window: float,
@@ -224,24 +224,24 @@ def judge_events(
     # The events that are not in the future, and a number for each node, time and count that occurs among them: its
     # identity. Identities are in order of time; of one time inputs come first, as node -1, then nodes and counts.
     candidates = np.flatnonzero(verdicts != FUTURE)
-    some = events.of(candidates)
+    some = events.select(candidates)
     identity = _rank_rows(some.time, some.node, some.sequence)
     # The number of the row that each belongs to, in order of time: that of its time, or one of its own.
     row = _rank_rows(some.time) if joint else identity
     # Late: the row was final before the event came. If that is the newest final row and not joint, an event of the
     # same identity made it: this one is a copy, and judged as such.
-    newest_final = _find_newest_final(some, row, window)
+    newest_final = _find_newest_final_row(some, row, window)
     is_late = row <= newest_final if joint else row < newest_final
     verdicts[candidates[is_late]] = LATE
     # Events that may take each other's place: of one node in one row. Most are alone there, and stay used.
     place = _rank_rows(some.time, some.node) if joint else identity
     has_rivals: Bool[np.ndarray, " places"] = np.bincount(place, minlength=1) > 1
     contenders = np.flatnonzero(has_rivals[place] & (row >= newest_final))
-    _judge_copies(verdicts, candidates[contenders], identity[contenders], place[contenders], values, joint)
+    _judge_repeated_events(verdicts, candidates[contenders], identity[contenders], place[contenders], values, joint)
     return verdicts
 
 
-def _judge_copies(
+def _judge_repeated_events(
     verdicts: Int[np.ndarray, " events"],
     numbers: np.ndarray,
     identities: np.ndarray,
@@ -285,7 +285,7 @@ def count_verdicts(
     }
 
 
-def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
+def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: int) -> int:
     """Return how many counts are missing between a node's messages, in the order of their times.
 
     After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,
@@ -300,8 +300,8 @@ def count_gaps(time: np.ndarray, sequence: Int[np.ndarray, " events"], period: i
     return int(np.sum(np.maximum(advances - 1, 0)))
 
 
-def number_equal_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return the number of each row among those that are equal to it, in their order, from 0."""
+def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
+    """Return for each row how many equal ones come before it; rows are entries of the columns at one index."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
     first = np.searchsorted(ranks[order], ranks[order])
@@ -321,8 +321,8 @@ def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     return ranks
 
 
-def _find_newest_final(
-    events: ArrivedEvents, rank: Int[np.ndarray, " events"], window: float
+def _find_newest_final_row(
+    events: EventsByArrival, rank: Int[np.ndarray, " events"], window: float
 ) -> Int[np.ndarray, " events"]:
     """Return the rank of the newest row that is final when each event comes, -1 for none.
 
@@ -339,7 +339,7 @@ def _find_newest_final(
     return np.maximum.accumulate(newest[:count])
 
 
-def counts_losses(network: Network, name: str) -> bool:
+def node_counts_losses(network: Network, name: str) -> bool:
     """Return whether the last number that a node receives is how many transmissions were lost before its values."""
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
@@ -362,7 +362,7 @@ def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndar
     return np.cumsum(begins_row) - 1, time[begins_row]
 
 
-def place_in_rows(
+def place_values_in_rows(
     values: Float[np.ndarray, "events size"], row: Int[np.ndarray, " events"], count: int
 ) -> Float[np.ndarray, "rows size"]:
     """Return the values of events in their rows, of which there are `count`; NaN where none arrived.
@@ -383,7 +383,7 @@ def fill_forward(values: Float[np.ndarray, "rows given"]) -> Float[np.ndarray, "
     return np.asarray(np.where(last < 0, 0.0, np.take_along_axis(values, np.maximum(last, 0), axis=0)))
 
 
-def lead_to_rows(
+def make_inputs_leading_to_rows(
     held: Float[np.ndarray, "rows given"], times: np.ndarray, unit: int, place: int
 ) -> Float[np.ndarray, "rows inputs"]:
     """Return the inputs that lead to each row in continuous time: those of the row before, and the time since it.

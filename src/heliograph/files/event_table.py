@@ -7,19 +7,19 @@ import numpy as np
 
 from heliograph.files.event_columns import (
     USED,
-    ArrivedEvents,
+    EventsByArrival,
     NodeEvents,
+    count_equal_rows_before,
     count_verdicts,
-    counts_losses,
     fill_forward,
     judge_events,
-    lead_to_rows,
-    number_equal_rows,
+    make_inputs_leading_to_rows,
+    node_counts_losses,
     number_rows,
-    place_in_rows,
+    place_values_in_rows,
 )
 from heliograph.files.recording import Recording
-from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.learning.losses.delays import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
 from heliograph.model.checks.refusal_reasons import Reason
@@ -60,9 +60,8 @@ class EventTable:
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
         """Begin with no event; `step`: seconds of a step, `start`: of step 0; `numbers`: whether times are numbers."""
         instance("network", network, Network, "a Network")
-        self.network, self.steps, self.numbers = network, TIME_STEP not in network.inputs, numbers
+        self.network, self.steps, self.numbers, self.start = network, TIME_STEP not in network.inputs, numbers, start
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
-        self.start = start
         self._plants: dict[str, dict[str, NodeEvents]] = {}
         self.notes: list[str] = []
         self.broken = ""
@@ -99,9 +98,9 @@ class EventTable:
         if len(self._plants) > 1:
             names = ", ".join(map(repr, list(self._plants)[:8]))
             raise fail("events", f"those of one plant, as events.of({next(iter(self._plants))!r}) has", names)
-        return next(iter(self._plants.values()), {}) or self._columns_of("")
+        return next(iter(self._plants.values()), {}) or self._columns_of_plant("")
 
-    def _columns_of(self, plant: str) -> dict[str, NodeEvents]:
+    def _columns_of_plant(self, plant: str) -> dict[str, NodeEvents]:
         """Return the columns of a plant by node, and of its inputs; empty ones where it is new."""
         if plant not in self._plants:
             sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
@@ -114,10 +113,10 @@ class EventTable:
 
         Without a time it is of that moment.
         """
-        columns = self._columns_of(reading.plant)[reading.node]
+        columns = self._columns_of_plant(reading.plant)[reading.node]
         time = arrival if reading.time is None else reading.time
         columns.time.append(time)
-        columns.arrival.append(time if self._at_once else arrival)
+        columns.arrival.append(time if self._times_are_steps else arrival)
         columns.sequence.append(-1 if reading.sequence is None else reading.sequence)
         columns.values.extend(reading.values.tolist())
         columns.period = reading.period
@@ -132,9 +131,9 @@ class EventTable:
         period: int,
     ) -> None:
         """Append readings of a node as `add` does one after another; `NONE` is no time, -1 no count."""
-        columns = self._columns_of("")[node]
+        columns = self._columns_of_plant("")[node]
         time = np.where(time == NONE, arrival, time)
-        for column, moments in ((columns.time, time), (columns.arrival, time if self._at_once else arrival)):
+        for column, moments in ((columns.time, time), (columns.arrival, time if self._times_are_steps else arrival)):
             column.frombytes(moments.tobytes())
         columns.sequence.frombytes(sequence.tobytes())
         columns.values.frombytes(values.tobytes())
@@ -143,13 +142,14 @@ class EventTable:
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
         """Note count and reason of a message that could not be read, where its node is known."""
         if unread.counted is not None:
-            self._columns_of(unread.counted.plant)[unread.counted.node].note_unread(unread, arrival)
+            self._columns_of_plant(unread.counted.plant)[unread.counted.node].note_unread(unread, arrival)
 
     @property
     def refusals(self) -> dict[str, Counter[Reason]]:
         """Return by node how many messages were refused for their flag or counter; nodes without any are absent."""
         counts = dict[str, Counter[Reason]]()
-        for node, columns in ((node, columns) for plant in self._plants.values() for node, columns in plant.items()):
+        by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
+        for node, columns in by_node:
             if columns.refused:
                 counts.setdefault(node, Counter()).update(columns.refused)
         return counts
@@ -178,7 +178,7 @@ class EventTable:
         Raises:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
-        by_node = [node for plant in self._plants.values() for node in plant.items()]
+        by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
         # Steps are no stamps; neither are numbers of a network that counts steps.
         for name, columns in by_node if self.dated or not self.steps else ():
             unset = columns.drop_unset_stamps_in_place(f"{source}, {name}")
@@ -212,7 +212,7 @@ class EventTable:
         return int(min(times))
 
     @property
-    def _at_once(self) -> bool:
+    def _times_are_steps(self) -> bool:
         """Return whether times are steps of messages, which say nothing of the moment of arrival."""
         return self.steps and self.step is None and not self.numbers
 
@@ -224,7 +224,7 @@ class EventTable:
     @property
     def dated(self) -> bool:
         """Return whether times are dates."""
-        return not self._at_once and not self.numbers
+        return not self._times_are_steps and not self.numbers
 
     @property
     def date(self) -> np.datetime64:
@@ -233,7 +233,7 @@ class EventTable:
 
     def sort_events(self) -> Iterator[Event]:
         """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
-        events, matrices, names = self._sort_by_arrival(), [*self._matrices().values()], [*self.network.names, INPUTS]
+        events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
         # Exact differences of whole nanoseconds before they are floats.
         for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
@@ -241,12 +241,9 @@ class EventTable:
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
-        """Return by node the seconds from measuring to logging of its events; inputs and nodes without any are absent.
-
-        The events are in order of their times.
-        """
+        """Return by node that has events the seconds from measuring to logging of each, in order of their times."""
         results, second = {}, 1 if self.numbers else SECOND
-        for name in () if self._at_once else self.network.names:
+        for name in () if self._times_are_steps else self.network.names:
             time, arrival, _ = self.columns[name].arrays()
             if len(time):
                 results[name] = ((arrival - time) / second)[np.argsort(time, kind="stable")]
@@ -296,7 +293,7 @@ class EventTable:
         """
         events, verdicts = self._judge_events(window, ahead)
         counts = {}
-        for node, (name, matrix) in zip((*range(len(self.network.names)), -1), self._matrices().items(), strict=True):
+        for node, name, matrix in self._number_value_matrices():
             used = events.place[(events.node == node) & (verdicts == USED)]
             counts[name] = int(np.sum(np.isnan(matrix[used]).all(axis=1)))
         return counts
@@ -328,34 +325,34 @@ class EventTable:
             ValueError: what `recording` refuses.
         """
         events, verdicts = self._judge_events(window, ahead)
-        events = events.of(verdicts == USED)
+        events = events.select(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
         # In order; inputs, of number -1, first at each time.
-        events = events.of(np.lexsort((events.sequence, events.node, events.time)))
+        events = events.select(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
         row, times = number_rows(events.time, self.steps, self._are_rows_joint)
         tables = self._fill_tables(events, row, len(times))
         inputs = fill_forward(tables.pop(INPUTS))
         if not self.steps:
-            inputs = lead_to_rows(inputs, times, self._unit, self.network.inputs.index(TIME_STEP))
+            inputs = make_inputs_leading_to_rows(inputs, times, self._unit, self.network.inputs.index(TIME_STEP))
         time = times.astype(np.float64) if self.steps or self.numbers else (times - self.origin) / SECOND
         measured = np.zeros(len(times), dtype=bool)
         measured[row[events.node >= 0]] = True
         return Recording(tables, inputs, time), measured
 
-    def _fill_tables(self, events: ArrivedEvents, row: np.ndarray, count: int) -> dict[str, np.ndarray]:
+    def _fill_tables(self, events: EventsByArrival, row: np.ndarray, count: int) -> dict[str, np.ndarray]:
         """Return the values of each node, and of the inputs, in their rows, (rows, values); NaN where none arrived.
 
         `row`: number of the row of each event, of `count` rows.
         """
         tables = {}
-        for n, (name, matrix) in zip((*range(len(self.network.names)), -1), self._matrices().items(), strict=True):
-            of_node = events.node == n
-            table = tables[name] = place_in_rows(matrix[events.place[of_node]], row[of_node], count)
-            if n >= 0 and counts_losses(self.network, name):
-                self.columns[name].fill_losses(table, row[of_node], events.sequence[of_node])
+        for node, name, matrix in self._number_value_matrices():
+            of_node = events.node == node
+            table = tables[name] = place_values_in_rows(matrix[events.place[of_node]], row[of_node], count)
+            if node >= 0 and node_counts_losses(self.network, name):
+                self.columns[name].write_losses_before_events(table, row[of_node], events.sequence[of_node])
         return tables
 
     @property
@@ -363,22 +360,27 @@ class EventTable:
         """Return whether all events of one time are one row."""
         return self.steps or self.network.common is not None
 
-    def _matrices(self) -> dict[str, np.ndarray]:
+    def _list_value_matrices(self) -> list[np.ndarray]:
         """Return the values of each node, (events, values), and last those of the inputs, whose number is -1."""
-        return {name: self.columns[name].matrix() for name in (*self.network.names, INPUTS)}
+        return [self.columns[name].value_matrix() for name in (*self.network.names, INPUTS)]
 
-    def _sort_by_arrival(self) -> ArrivedEvents:
+    def _number_value_matrices(self) -> Iterator[tuple[int, str, np.ndarray]]:
+        """Yield number, name and values (events, values) of each node, and last of the inputs, whose number is -1."""
+        names = [*self.network.names, INPUTS]
+        return zip((*range(len(names) - 1), -1), names, self._list_value_matrices(), strict=True)
+
+    def _sort_by_arrival(self) -> EventsByArrival:
         """Return the events in order of arrival; those without a count are told apart by their order at a time."""
         parts = []
         for node, name in enumerate((INPUTS, *self.network.names), -1):
             time, arrival, sequence = self.columns[name].arrays()
-            parts.append(ArrivedEvents(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
-        events = ArrivedEvents(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+            parts.append(EventsByArrival(np.full(len(time), node), time, arrival, sequence, np.arange(len(time))))
+        events = EventsByArrival(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         if not len(events.time):
             raise fail("events", "at least one", "none")
-        events = events.of(np.lexsort((events.place, events.arrival)))
+        events = events.select(np.lexsort((events.place, events.arrival)))
         uncounted = events.sequence < 0
-        events.sequence[uncounted] = number_equal_rows(events.node[uncounted], events.time[uncounted])
+        events.sequence[uncounted] = count_equal_rows_before(events.node[uncounted], events.time[uncounted])
         # Moments to the nearest step from the first.
         if self.step is None:
             return events
@@ -386,9 +388,9 @@ class EventTable:
         time, arrival = ((moments - first + half) // self.step for moments in (events.time, events.arrival))
         return events._replace(time=time, arrival=arrival)
 
-    def _judge_events(self, window: float, ahead: float) -> tuple[ArrivedEvents, Int[np.ndarray, " events"]]:
+    def _judge_events(self, window: float, ahead: float) -> tuple[EventsByArrival, Int[np.ndarray, " events"]]:
         """Return the events in order of arrival, and what a timeline with this window would do with each."""
-        events, matrices = self._sort_by_arrival(), [*self._matrices().values()]
+        events, matrices = self._sort_by_arrival(), self._list_value_matrices()
 
         def values(i: int) -> np.ndarray:
             """Return the values of the event with number i."""

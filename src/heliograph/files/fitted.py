@@ -94,20 +94,22 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
     Raises:
         ValueError: what `load_network` refuses; a file that is no result of a fit of this network.
     """
-    file_path("network", reference)
-    path, description = file_path("fitted numbers", fitted), describe(NetworkAgain(str(reference)))
+    file_path("network", reference)  # checked alone: the name of a module is no path
+    path = file_path("fitted numbers", fitted)
+    # The network as a function of its free numbers: it is built anew for each call, so that `hg.free` takes them.
+    network_of_numbers = describe(NetworkAgain(str(reference)))
     try:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise fail(f"fitted numbers {path}", "a file that `heliograph fit` wrote", type(error).__name__) from None
-    known = {parameter.name: parameter.start.shape for parameter in description.parameters.every}
+    known = {parameter.name: parameter.start.shape for parameter in network_of_numbers.parameters.every}
     if {name: np.shape(value) for name, value in values.items()} != known:
         raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
-    return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
+    return network_of_numbers.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
 
 
 def _tabulate_delays(delays: Delays) -> dict[str, Any]:
-    """Return a law of delays as tables for JSON."""
+    """Return a law of delays as JSON has it: its step, how many messages it is of, and a row for each delay."""
     shares = [{"steps": steps, **share._asdict()} for steps, share in delays.shares.items()]
     return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 

@@ -47,12 +47,12 @@ def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
         if not path.is_file():
             got = "a folder" if path.is_dir() else "nothing of that name"
             raise fail(f"network {source_name}", "a Python file", got)
-        with _import_from(path.parent):
+        with _allow_imports_from(path.parent):
             module = _call_user_code(lambda: _run_source(path, path.read_bytes()), source_name, path)
             return _find_network(module, name, source_name, path), vars(module)
     # A module, by its name.
-    with _import_from(Path.cwd()):
-        source = _call_user_code(lambda: _find_source(source_name), source_name, None)
+    with _allow_imports_from(Path.cwd()):
+        source = _call_user_code(lambda: _find_source_file(source_name), source_name, None)
         module = _call_user_code(lambda: importlib.import_module(source_name), source_name, source)
         return _find_network(module, name, source_name, source), vars(module)
 
@@ -75,7 +75,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     """
     reference = f"{path.name}:{name}"
     # Run the source as a module, and find the function in it.
-    with _import_from(path.parent):
+    with _allow_imports_from(path.parent):
         module = _call_user_code(lambda: _run_source(path, source), path.name, path)
     function = getattr(module, name, None)
     if not callable(function):
@@ -86,7 +86,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
         """Return the network that the function returns, checked."""
-        with _import_from(path.parent):
+        with _allow_imports_from(path.parent):
             network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
             raise fail(f"network {reference}", "a heliograph.Network", type(network).__name__)
@@ -128,7 +128,7 @@ def _read_named_network(
     return value
 
 
-def _find_source(module: str) -> Path | None:
+def _find_source_file(module: str) -> Path | None:
     """Return the file of an importable module, so that errors are reported with their line."""
     spec = find_spec(module)
     if spec is None:
@@ -172,7 +172,7 @@ def _find_error_line(error: BaseException, path: Path | None) -> str:
 
 
 @contextmanager
-def _import_from(folder: Path) -> Iterator[None]:
+def _allow_imports_from(folder: Path) -> Iterator[None]:
     """Let imports find modules in `folder` first."""
     entry = str(folder.resolve())
     sys.path.insert(0, entry)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.rows import Rows, convert_to_nanoseconds, numbers_of
-from heliograph.files.text.dialects import check_distinct
+from heliograph.files.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import fail
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def read_parquet_blocks(
     path: Path, only: Container[str] | None, rows: int, progress: Progress | None = None
-) -> Iterator[Rows]:
+) -> Iterator[TableRows]:
     """Yield the rows of a Parquet file, so many at a time: numbers, NaN where null, and dates in nanoseconds.
 
     Args:
@@ -47,7 +47,7 @@ def read_parquet_blocks(
         raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
 
 
-def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, first: int) -> Rows:
+def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, first: int) -> TableRows:
     """Return the rows of a table of Arrow as numbers and dates; an empty cell is NaN or NaT.
 
     Args:
@@ -73,10 +73,10 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
             columns[name] = convert_to_nanoseconds(days, f"{path}, column {name!r}", first)
             continue
         if pa.types.is_integer(kind) and not column.null_count:
-            columns[name] = numbers_of(column.to_numpy())
+            columns[name] = convert_to_numbers(column.to_numpy())
             continue
         is_number = pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)
         if not (is_number or pa.types.is_null(kind)):
             raise fail(f"{path}, row {first}, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
         columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
-    return Rows(columns, np.arange(first, first + table.num_rows), [])
+    return TableRows(columns, np.arange(first, first + table.num_rows), [])

@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from heliograph.files.recording_cells import RowChecks, list_received_columns, list_truth_columns, read_cells
-from heliograph.files.rows import Rows
-from heliograph.files.table import TIME, columns_of, read_rows, write_table
-from heliograph.files.table_rows import KeptRows, RowsAsColumns, join_cells, keep_rows, order_rows
-from heliograph.files.table_writer import read_back_name
-from heliograph.model.checks.plant_inputs import find_time_step_fault
+from heliograph.files.recording_cells import RowRefusals, list_received_columns, list_truth_columns, read_cells
+from heliograph.files.recording_rows import (
+    RecordingRows,
+    RowsWithMissing,
+    insert_missing_rows,
+    join_recording_rows,
+    order_rows,
+)
+from heliograph.files.table import TIME, convert_to_columns, read_rows, write_table
+from heliograph.files.table_rows import TableRows
+from heliograph.files.table_writer import predict_name_read_back
+from heliograph.model.checks.inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
@@ -22,7 +28,7 @@ from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
-    from heliograph.files.stores.tables import StoreTable
+    from heliograph.files.stores.store_tables import StoreTable
 
 
 @readable
@@ -65,9 +71,9 @@ def read_recording(table: object, network: Network, name: str = "recording", ign
     instance("network", network, Network, "a Network")
     source = str(table) if isinstance(table, str | Path) else name
     reader = RowReader(network, source, strict=True, ignore_unknown=flag("ignore_unknown", ignore_unknown))
-    columns = columns_of(table, source, reader.only)
+    columns = convert_to_columns(table, source, reader.only)
     rows = len(next(iter(columns.values()), ()))
-    return reader.read(Rows(columns, np.arange(1, rows + 1), []))
+    return reader.read(TableRows(columns, np.arange(1, rows + 1), []))
 
 
 def read_recording_rows(
@@ -127,7 +133,7 @@ def _map_headers(network: Network) -> dict[str, str]:
     headers |= {f"truth.{append_unit(name)}": f"truth.{name}" for name in network.states}
     for node, components in received.items():
         headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for name in components}
-    as_written = {read_back_name(header): name for header, name in headers.items()}
+    as_written = {predict_name_read_back(header): name for header, name in headers.items()}
     without_unit = {name: name for name in (TIME, *headers.values())}
     return as_written | headers | without_unit
 
@@ -165,16 +171,16 @@ class RowReader:
             return []
         return [f"{self.source}: rows that came after later ones, used in the order of their times: {self._behind}"]
 
-    def read(self, rows: Rows) -> Recording:
+    def read(self, rows: TableRows) -> Recording:
         """Return the rows that can be read.
 
         Raises:
             ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
                 reading is strict. One line that names the row, from 1, and the column.
         """
-        return self.arrange(self.read_cells(rows))
+        return self.arrange_recording(self.read_cells(rows))
 
-    def arrange(self, cells: RowsAsColumns) -> Recording:
+    def arrange_recording(self, cells: RecordingRows) -> Recording:
         """Return rows as a recording; unless reading is strict, in the order of their times.
 
         Raises:
@@ -182,7 +188,7 @@ class RowReader:
         """
         return self.make_recording(self.put_in_order(cells))
 
-    def put_in_order(self, cells: RowsAsColumns) -> RowsAsColumns:
+    def put_in_order(self, cells: RecordingRows) -> RecordingRows:
         """Return rows in the order of their times, as far as that can be; where reading is strict, as they are."""
         if self._strict:
             return cells
@@ -191,7 +197,7 @@ class RowReader:
         self._behind += behind
         return cells
 
-    def make_recording(self, cells: RowsAsColumns, before: RowsAsColumns | None = None) -> Recording:
+    def make_recording(self, cells: RecordingRows, before: RecordingRows | None = None) -> Recording:
         """Return rows in the order of their times as a recording.
 
         Args:
@@ -204,8 +210,8 @@ class RowReader:
         """
         # The row before goes in first, and its own row is left out at the end.
         begin = 0 if before is None else 1
-        cells = cells if before is None else join_cells([before, cells])
-        kept = keep_rows(cells.numbers, self.network, 1 if before is None else int(before.numbers[0]))
+        cells = cells if before is None else join_recording_rows([before, cells])
+        kept = insert_missing_rows(cells.numbers, self.network, 1 if before is None else int(before.numbers[0]))
         time = kept.fill_times(cells.time)
         u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
         measurements = {node: kept.fill(values)[begin:] for node, values in cells.measurements.items()}
@@ -216,21 +222,21 @@ class RowReader:
             truth = np.stack(states, axis=1)[begin:]
         return Recording(measurements, u[begin:], time[begin:], truth)
 
-    def read_cells(self, rows: Rows) -> RowsAsColumns:
+    def read_cells(self, rows: TableRows) -> RecordingRows:
         """Return what stands in the rows that can be read, each by itself.
 
         Raises:
             ValueError: what `read` refuses, but for times that go backwards.
         """
         columns = {self._headers.get(name, name): values for name, values in rows.columns.items()}
-        checks = RowChecks(self.source, rows.numbers, self._strict)
-        cells = read_cells(columns, self.network, checks)
-        self.refused += [*rows.refused, *checks.refused]
-        return cells.of(checks.good)
+        refusals = RowRefusals(self.source, rows.numbers, self._strict)
+        cells = read_cells(columns, self.network, refusals)
+        self.refused += [*rows.refused, *refusals.refused]
+        return cells.select(refusals.good)
 
 
 def _make_inputs(
-    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "KeptRows", source: str
+    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "RowsWithMissing", source: str
 ) -> np.ndarray:
     """Return the inputs (rows, inputs); raise ValueError where times go backwards or a time step is impossible.
 
@@ -243,7 +249,7 @@ def _make_inputs(
     _warn_of_equal_times(time, source)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
-        u[:, i] = given[name][rows.of] if name in given else seconds_between(time)
+        u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
         if name == TIME_STEP and (fault := find_time_step_fault(u[:, i])):
             raise fail(f"{source}, row {rows.numbers[fault.row]}, column {name!r}", fault.expected, fault.came)
     return u

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.block_order import BlockOrder
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.recording import Recording, RowReader
-from heliograph.files.rows import Rows
+from heliograph.files.row_order_across_blocks import BlockOrderCheck
 from heliograph.files.table import read_row_blocks
+from heliograph.files.table_rows import TableRows
 from heliograph.files.text.text_file import Progress
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network
@@ -79,9 +79,9 @@ class RecordingBlocks:
         if not self.rows:
             raise self.reasons[0] if self.reasons else fail(str(self._path), "at least one row", "none")
 
-    def _yield_recordings(self, parts: Iterable[Rows]) -> Iterator[Recording]:
+    def _yield_recordings(self, parts: Iterable[TableRows]) -> Iterator[Recording]:
         """Yield parts of a table as recordings, each of which goes on from the last row of the one before it."""
-        order = BlockOrder(self._path, self._reader.network)
+        order = BlockOrderCheck(self._path, self._reader.network)
         for rows in parts:
             self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
             if not len(rows.numbers):
@@ -100,7 +100,7 @@ class RecordingBlocks:
                 recording = self._reader.make_recording(cells, last_before)
             self.doubts += [str(doubt.message) for doubt in doubts]
             yield recording
-        order.check_left_out()
+        order.check_left_out_rows()
 
     def _note_progress(self, done: int, total: int) -> None:
         """Keep how much of the file is read, and tell it."""

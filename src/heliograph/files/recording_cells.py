@@ -6,15 +6,15 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from heliograph.files.recording_rows import RecordingRows
 from heliograph.files.table import TIME
-from heliograph.files.table_rows import RowsAsColumns
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
 from heliograph.simulation.network import Network
 
 
-class RowChecks:
-    """Refuses rows of a table that cannot be read: the first is an error, or each is noted with the reason.
+class RowRefusals:
+    """Rows of a table that were refused, with the reasons; where reading is strict the first one is raised.
 
     Attributes:
         good: of each row whether nothing was wrong so far.
@@ -47,9 +47,9 @@ class RowChecks:
         self.good &= ~bad
 
 
-def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowChecks) -> RowsAsColumns:
-    """Return what stands in the columns of a table; rows that cannot be read are refused by `checks`."""
-    inputs, source = network.inputs, checks.source
+def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: RowRefusals) -> RecordingRows:
+    """Return what stands in the columns of a table; rows that cannot be read are refused by `refusals`."""
+    inputs, source = network.inputs, refusals.source
     # By node the columns that each component of its measurements may have: of several names one.
     received = list_received_columns(network)
     # A relay may have no columns at all: the data of other nodes do not need what it received itself, so that only a
@@ -66,22 +66,22 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, checks: RowC
         *(names for components in received.values() for names in components),
         *((name,) for name in truth_columns.values()),
     ]
-    _refuse_unknown(columns, expected, source)
-    time = _read_times(columns, _find_column(columns, (TIME,), source), checks)
+    _refuse_unknown_columns(columns, expected, source)
+    time = _read_times(columns, _find_column(columns, (TIME,), source), refusals)
     measurements = {}
     for node, components in received.items():
         found = [_find_column(columns, names, source) for names in components]
-        measurements[node] = np.stack([_read_measurements(columns, column, checks) for column in found], axis=1)
+        measurements[node] = np.stack([_read_measurements(columns, column, refusals) for column in found], axis=1)
     # All inputs have to be there, but for a time step dt, which times say too.
     given = {
-        name: _read_complete(columns, _find_column(columns, (name,), source), checks)
+        name: _read_column_without_gaps(columns, _find_column(columns, (name,), source), refusals)
         for name in inputs
         if name != TIME_STEP or name in columns
     }
     truth = {
-        state: _read_measurements(columns, name, checks) for state, name in truth_columns.items() if name in columns
+        state: _read_measurements(columns, name, refusals) for state, name in truth_columns.items() if name in columns
     }
-    return RowsAsColumns(checks.numbers, time, measurements, given, truth)
+    return RecordingRows(refusals.numbers, time, measurements, given, truth)
 
 
 def list_truth_columns(network: Network) -> dict[str, str]:
@@ -107,7 +107,7 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     return {node: [list_allowed(node, name) for name in components] for node, components in names.items()}
 
 
-def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
+def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
     """Raise one line with the closest known name if a column belongs to nothing of the network."""
     known = [name for names in expected for name in names]
     for column in columns:
@@ -127,26 +127,26 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
     return present[0]
 
 
-def _read_times(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
     """Return the times of the rows, dates where the column holds dates."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
-        return _read_complete(columns, name, checks)
-    checks.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
+        return _read_column_without_gaps(columns, name, refusals)
+    refusals.refuse(np.isnat(values), name, "a date", lambda row: "an empty cell")
     return values.astype("datetime64[ns]")
 
 
-def _read_complete(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
     """Return the numbers of a column in which every cell has to have one."""
-    values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, checks.source)
-    checks.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
+    values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
+    refusals.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
-def _read_measurements(columns: Mapping[str, np.ndarray], name: str, checks: RowChecks) -> np.ndarray:
+def _read_measurements(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
     """Return the numbers of a column, NaN where a cell is empty."""
-    values = _read_numbers(columns, name, checks.source)
-    checks.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
+    values = _read_numbers(columns, name, refusals.source)
+    refusals.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
     return values
 
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph.files.inspection import Topic
+from heliograph.files.topic_inspection import TopicStatistics
 
 DEGREES = ("deg", "degs", "degree", "degrees", "°")  # of an angle
 FEW = 6  # fields that a suggestion lists
 
 
-def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[str]]) -> str:
+def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, Sequence[str]]) -> str:
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
     Args:
@@ -18,45 +18,45 @@ def suggest_sources(topics: Mapping[str, Topic], names: Mapping[str, Sequence[st
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
     lines.append("sources = {")
     for topic in topics.values():
-        topic.choose_time()
+        topic.choose_time_field()
     # Whether any topic has dates: then a clock that counts from its own start needs the date of that.
     dated = any(topic.dates or (topic.logged and not topic.own_clock) for topic in topics.values())
     for name, topic in sorted(topics.items()):
-        fields = topic.list_measured()
+        fields = topic.list_fields_by_likelihood()
         if not fields:
             continue
         options = _suggest_options(topic, dated)
         source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{options})"
-        lines.append(f"    {name!r}: {source},{_say_unit(topic, fields[0])}")
-        others = [f"{path}{_say_unit(topic, path, '')}" for path in fields[1:FEW]]
+        lines.append(f"    {name!r}: {source},{_comment_on_unit(topic, fields[0])}")
+        others = [f"{path}{_comment_on_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
         lines += [f"    #   or {more}"] if more else []
     return "\n".join([*lines, "}"])
 
 
-def _suggest_options(topic: Topic, dated: bool) -> str:
+def _suggest_options(topic: TopicStatistics, dated: bool) -> str:
     """Return a source's options for a topic's time and count; `dated`: whether there are dates in any topic."""
     options = ""
     if topic.time is not None:
-        options += f", time={_describe_time(topic, dated)}"
+        options += f", time={_write_time_option(topic, dated)}"
         unit = topic.units.get(topic.time, "s")
         options += "" if unit == "s" else f", time_unit={unit!r}"
     if topic.count is not None:
-        options += f", sequence={_describe_count(topic, topic.count)}"
+        options += f", sequence={_write_count_option(topic, topic.count)}"
     return options
 
 
-def _describe_time(topic: Topic, dated: bool) -> str:
+def _write_time_option(topic: TopicStatistics, dated: bool) -> str:
     """Return a time as a source has it: beside dates a clock that counts from its own start has the date of that."""
     return f"hg.files.Stamp({topic.time!r}, start='DATE')" if topic.own_clock and dated else repr(topic.time)
 
 
-def _describe_count(topic: Topic, path: str) -> str:
+def _write_count_option(topic: TopicStatistics, path: str) -> str:
     """Return a running count as a source has it: with its bits, where the file says them."""
     return f"hg.files.Count({path!r}, bits={topic.bits[path]})" if path in topic.bits else repr(path)
 
 
-def _say_unit(topic: Topic, path: str, mark: str = "  #") -> str:
+def _comment_on_unit(topic: TopicStatistics, path: str, mark: str = "  #") -> str:
     """Return the unit of a field as a comment, "" if the file names none; of degrees, what makes them radians."""
     if path not in topic.measured_in:
         return ""

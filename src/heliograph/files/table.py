@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.disk.whole_file import FORMATS, format_of
+from heliograph.disk.atomic_files import FORMATS, format_of
 from heliograph.files.block_size import USUAL_BLOCK, BlockSize
 from heliograph.files.csv_columns import read_csv_blocks
 from heliograph.files.parquet_columns import read_parquet_blocks
-from heliograph.files.rows import Rows, convert_to_nanoseconds, join_rows, numbers_of
+from heliograph.files.table_rows import TableRows, convert_to_nanoseconds, convert_to_numbers, join_rows
 from heliograph.files.table_writer import open_table
-from heliograph.files.text.dialects import check_distinct
-from heliograph.files.text.text_file import Progress, kind_of
+from heliograph.files.text.csv_dialects import check_distinct
+from heliograph.files.text.text_file import Progress, find_extension
 from heliograph.numerics.check import fail, file_path, show_value, table
 from heliograph.numerics.masked_arrays import fill_masked, is_absent
 from heliograph.numerics.process.plugins import FORMATS as FORMATS_OF_OTHERS
@@ -25,7 +25,7 @@ from heliograph.numerics.types import Shaped
 TIME = "time"
 
 
-def columns_of(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
+def convert_to_columns(table: object, name: str = "table", only: Container[str] | None = None) -> dict[str, np.ndarray]:
     """Return columns by name, missing values NaN or NaT: numbers as float64, dates as datetime64[ns] in UTC.
 
     Whole numbers that float64 cannot tell apart stay int64. Columns that are not among `only` are left out unread.
@@ -60,13 +60,13 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     if column.dtype.kind == "M":
         return convert_to_nanoseconds(column, name)
     if column.dtype.kind in "fiub":
-        return numbers_of(column)
+        return convert_to_numbers(column)
     if column.dtype.kind in "OUT":
-        return _convert_objects(column, name)
+        return _convert_object_column(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
 
 
-def _convert_objects(column: np.ndarray, name: str) -> np.ndarray:
+def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
     """Return a column of objects as numbers, NaN for None, or as dates; the first value says which.
 
     Text is no number, though it may read as one.
@@ -108,7 +108,7 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
     return read_rows(file_path("table", path), None, strict=True).columns
 
 
-def read_rows(path: Path, only: Container[str] | None, strict: bool) -> Rows:
+def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRows:
     """Read the rows of a file, or those of its columns that are among `only`.
 
     Raises:
@@ -126,7 +126,7 @@ def read_row_blocks(
     strict: bool,
     block: BlockSize = USUAL_BLOCK,
     progress: Progress | None = None,
-) -> Iterator[Rows]:
+) -> Iterator[TableRows]:
     """Yield the rows of a file in parts, of those of its columns that are among `only`.
 
     Args:
@@ -140,7 +140,7 @@ def read_row_blocks(
         ValueError: what `read_table` refuses, but for a table without rows.
     """
     # A format of our own, or one that a package of somebody else's reads; `format_of` raises at any other.
-    kind, is_ours = kind_of(path), kind_of(path) in FORMATS
+    kind, is_ours = find_extension(path), find_extension(path) in FORMATS
     plugin = None if is_ours else find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
     if plugin is None and not is_ours:
         kind = format_of(path)
@@ -149,8 +149,8 @@ def read_row_blocks(
     if path.stat().st_size == 0:
         raise fail(str(path), "a table with a header and rows", "an empty file")
     if plugin is not None:
-        columns = columns_of(plugin(path), str(path), only)
-        yield Rows(columns, np.arange(1, len(next(iter(columns.values()), ())) + 1), [])
+        columns = convert_to_columns(plugin(path), str(path), only)
+        yield TableRows(columns, np.arange(1, len(next(iter(columns.values()), ())) + 1), [])
     elif kind == ".csv":
         yield from read_csv_blocks(path, only, strict, block.bytes, progress)
     else:

@@ -1,119 +1,68 @@
-"""Rows of a table that were read: what stands in them, in which order they are, and which steps they are of."""
+"""Rows of a table as columns of numbers and dates, a part of the table at a time or all of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import TIME
-from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.row_times import find_backwards_row
-from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
-from heliograph.simulation.network import Network
 
-MOST_OUT = 0.5  # share of the rows below which those that are out of order, or whose times were not set, are refused
+EXACT = 2**53  # up to here doubles hold every whole number
 
 
-class RowsAsColumns(NamedTuple):
-    """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
+class TableRows(NamedTuple):
+    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read."""
 
+    columns: dict[str, np.ndarray]
     numbers: np.ndarray
-    time: np.ndarray
-    measurements: dict[str, np.ndarray]
-    inputs: dict[str, np.ndarray]
-    truth: dict[str, np.ndarray]
-
-    def of(self, good: np.ndarray | slice) -> "RowsAsColumns":
-        """Return the rows of a mask, of numbers, or of a slice."""
-        parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
-        return RowsAsColumns(self.numbers[good], self.time[good], *parts)
+    refused: list[InputError]
 
 
-def join_cells(parts: Sequence[RowsAsColumns]) -> RowsAsColumns:
+def join_rows(parts: Iterable[TableRows]) -> TableRows:
     """Return the rows of several parts of a table, one after the other."""
-    named = (
-        {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
-        for i in range(2, len(RowsAsColumns._fields))
-    )
-    return RowsAsColumns(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+    parts = list(parts)
+    filled = [part for part in parts if len(part.numbers)] or parts[-1:]
+    names = filled[0].columns if filled else ()
+    columns = {name: _join_column([part.columns[name] for part in filled]) for name in names}
+    numbers = np.concatenate([np.zeros(0, dtype=np.int64), *(part.numbers for part in filled)])
+    return TableRows(columns, numbers, [error for part in parts for error in part.refused])
 
 
-def order_rows(cells: RowsAsColumns, network: Network, source: str) -> tuple[RowsAsColumns, list[InputError], int]:
-    """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
+def _join_column(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the parts of a column, one after the other, as dates, float64 or int64: what holds all of them.
 
-    Where time is continuous a time that is more than a year outside of all others was not set: its row is refused, and
-    the others are put in the order of their times. Where each row is a step, rows are refused until times do not go
-    backwards, as few as possible. Rows stay as they are where half of them or more would be refused, and beside a
-    column `dt`, whose numbers belong to the order of the rows.
-
-    Args:
-        cells: the rows.
-        network: the network that they belong to.
-        source: name of the table, for errors.
+    A part of int64 has numbers too large for doubles. So the column stays int64 where all its numbers are whole, since
+    float64 would round the large ones.
     """
-    if find_backwards_row(cells.time) is None:
-        return cells, [], 0
-    dated = cells.time.dtype.kind == "M"
-    stamps = cells.time.astype(np.int64) if dated else cells.time
-    is_continuous = TIME_STEP in network.inputs
-    if is_continuous:
-        is_refused = find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND)
-        expected = "a time that was set, near the others"
-    else:
-        is_refused = find_out_of_order(stamps)
-        expected = "a time that does not go backwards"
-    if TIME_STEP in cells.inputs or np.mean(is_refused) >= MOST_OUT:
-        return cells, [], 0
-    refused = [
-        fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
-        for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
-    ]
-    kept = cells.of(~is_refused)
-    latest_so_far = np.maximum.accumulate(kept.time)
-    behind = int(np.count_nonzero(kept.time < latest_so_far))
-    return kept.of(np.argsort(kept.time, kind="stable")), refused, behind
+    kinds = {part.dtype.kind for part in parts}
+    if "M" in kinds:  # a part without dates has empty cells alone, as those before the first date
+        parts = [part if part.dtype.kind == "M" else np.full(len(part), "NaT", "datetime64[ns]") for part in parts]
+    elif kinds == {"i", "f"} and all(_are_whole_numbers(part) for part in parts):
+        parts = [part.astype(np.int64) for part in parts]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-class KeptRows(NamedTuple):
-    """Rows that a recording has, of which some may stand for rows that did not arrive.
+def _are_whole_numbers(numbers: np.ndarray) -> bool:
+    """Return whether all numbers are whole, and of a size at which doubles hold each."""
+    return numbers.dtype.kind == "i" or bool(np.all((np.abs(numbers) < EXACT) & (numbers == np.trunc(numbers))))
 
-    Attributes:
-        numbers: their numbers in the table, from 1.
-        of: index of the row that was read from which each is taken: its own, or the one before it.
-        arrived: whether it was read itself.
+
+def convert_to_numbers(column: np.ndarray) -> np.ndarray:
+    """Return numbers as float64, or as int64 where that alone tells them apart."""
+    whole = column.dtype.kind in "iu" and column.size and np.abs(column.astype(np.float64)).max() >= EXACT
+    return np.asarray(column, dtype=np.int64 if whole and column.dtype != np.uint64 else np.float64)
+
+
+def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.ndarray:
+    """Return dates as datetime64[ns]; `first` is the number of their first row, for errors.
+
+    Raises:
+        ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
     """
-
-    numbers: np.ndarray
-    of: np.ndarray
-    arrived: np.ndarray
-
-    def fill(self, values: np.ndarray) -> np.ndarray:
-        """Return values of these rows, NaN where one did not arrive."""
-        filled = np.array(values[self.of], dtype=np.float64)
-        filled[~self.arrived] = np.nan
-        return filled
-
-    def fill_times(self, time: np.ndarray) -> np.ndarray:
-        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
-        missing = np.flatnonzero(~self.arrived)
-        filled = np.array(time[self.of])
-        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
-        before, after = self.of[missing], np.minimum(self.of[missing] + 1, len(time) - 1)
-        numbers = self.numbers[self.arrived]
-        share = np.maximum(self.numbers[missing] - numbers[before], 0) / np.maximum(numbers[after] - numbers[before], 1)
-        moved = share * (time[after] - time[before]).astype(np.float64)
-        filled[missing] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
-        return filled
-
-
-def keep_rows(numbers: np.ndarray, network: Network, first: int = 1) -> KeptRows:
-    """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
-
-    Steps begin with the row of number `first`.
-    """
-    if TIME_STEP in network.inputs or not len(numbers):
-        return KeptRows(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
-    steps = np.arange(first, numbers[-1] + 1)
-    before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
-    return KeptRows(steps, before, numbers[before] == steps)
+    moments = column.astype("datetime64[ns]")
+    # Converted back, what overflowed or lost a part of a nanosecond is another date.
+    wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise fail(f"{name}, row {first + row}", "a date in whole nanoseconds, from 1678 to 2261", column[row])
+    return np.asarray(moments)

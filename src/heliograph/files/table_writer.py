@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, TextIO
 import msgspec
 import numpy as np
 
-from heliograph.disk.quoting import quote_for_cell, unquote_cell
-from heliograph.disk.whole_file import check_writable, format_of, whole_file
-from heliograph.files.text.dialects import check_distinct
+from heliograph.disk.atomic_files import check_writable, format_of, whole_file
+from heliograph.disk.quoted_text import quote_for_cell, unquote_cell
+from heliograph.files.text.csv_dialects import check_distinct
 from heliograph.numerics.times.dates import format_dates
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def _open_csv(path: Path) -> Iterator[Append]:
         def append(columns: Mapping[str, np.ndarray]) -> None:
             """Append rows, behind the names of the columns in the first line."""
             if not file.tell():
-                check_distinct(f"columns of {path}", [read_back_name(name) for name in columns])
+                check_distinct(f"columns of {path}", [predict_name_read_back(name) for name in columns])
                 csv.writer(file).writerow(map(quote_for_cell, columns))
             _write_csv_rows(columns, file)
 
@@ -112,7 +112,7 @@ def _format_cells(column: np.ndarray) -> list[str]:
     return texts
 
 
-def read_back_name(name: str) -> str:
+def predict_name_read_back(name: str) -> str:
     """Return the name of a column as it reads from a CSV file to which it was written: in one line, without margins."""
     return unquote_cell(quote_for_cell(name).strip())
 

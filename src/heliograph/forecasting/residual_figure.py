@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import beta
 
-from heliograph.disk.palette import COLOURS
+from heliograph.disk.colours_of_figures import COLOURS
 
 if TYPE_CHECKING:  # it takes a second
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.palette import COLOURS
+from heliograph.disk.colours_of_figures import COLOURS
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import array, fail, scalar, show_value, table
 from heliograph.numerics.module import readable

@@ -1,6 +1,6 @@
 """Public names of the room, which needs the extra `report`; the package loads them when first used."""
 
-from .health import (
+from .recording_diagnosis import (
     FilterHealth as FilterHealth,
     examine as examine,
 )

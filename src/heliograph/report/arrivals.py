@@ -17,8 +17,8 @@ from heliograph.model.trigger import Periodic
 from heliograph.numerics.check import InputError
 from heliograph.numerics.confidence_intervals import count_independent
 from heliograph.numerics.types import Bool, Float, Int
-from heliograph.report.sending_pattern import Pattern, find_pattern
-from heliograph.report.sending_rate import Rate, find_rate
+from heliograph.report.sending_pattern import SendingPattern, find_pattern
+from heliograph.report.sending_rate import SendingRate, find_rate
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -60,7 +60,7 @@ class Arrivals:
     watched: bool = False
 
     @cached_property
-    def rate(self) -> Rate | None:
+    def rate(self) -> SendingRate | None:
         """The mean rate of a sender whose clock is not that of the rows; None where a pattern of rows explains as much.
 
         None too where its period is declared, and where rows are messages. Of rate and pattern the one that says that
@@ -83,7 +83,7 @@ class Arrivals:
         Declared, or found: it has a rate of its own, or nearly all intervals between arrivals are whole multiples of
         their median. Losses of a sender that is due in each row leave intervals of all lengths, and no such period.
         """
-        clock = _read_clock(self.time)
+        clock = _convert_times_to_numbers(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
         if self.declared_period is not None:
             return self.declared_period * spacing if self.declared_period > 1 else None
@@ -107,7 +107,7 @@ class Arrivals:
         """
         if self.period is None:
             return None if self.of_messages and not self.arrived.all() else self.arrived
-        clock = _read_clock(self.time)
+        clock = _convert_times_to_numbers(self.time)
         arrivals = clock[self.arrived]
         if not len(arrivals):
             return np.zeros(max(int((clock[-1] - clock[0]) / self.period), 1), dtype=bool)
@@ -122,7 +122,7 @@ class Arrivals:
         return slots
 
     @cached_property
-    def pattern(self) -> Pattern | None:
+    def pattern(self) -> SendingPattern | None:
         """The slots in which it is due, where these return as a pattern, such as 3 of each 4; None if it is in each.
 
         A sender that says when it is due has none.
@@ -153,7 +153,7 @@ class Arrivals:
         lost = np.flatnonzero(~self.slots & due)
         if self.period is None:
             return self.time[lost]
-        clock, filled = _read_clock(self.time), np.flatnonzero(self.slots)
+        clock, filled = _convert_times_to_numbers(self.time), np.flatnonzero(self.slots)
         times = clock[self.arrived]
         if len(filled) != len(times):  # several came in one slot: slots evenly from the first arrival to the last
             times = np.interp(filled, [filled[0], max(filled[-1], filled[0] + 1)], [times[0], times[-1]])
@@ -213,7 +213,7 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
     return len(arrived) > 1 and bool(np.all(nodes_at_time > 0) and np.median(nodes_at_time) <= 1)
 
 
-def _read_clock(time: np.ndarray) -> Float[np.ndarray, " time"]:
+def _convert_times_to_numbers(time: np.ndarray) -> Float[np.ndarray, " time"]:
     """Return the times as numbers (time,): dates as seconds after the first."""
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
@@ -244,7 +244,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
         receiver = network.nodes[node]
         limits = receiver.limits
         refuses_values, refuses_stuck_values = limits is not None, limits is not None and limits.stuck is not None
-        declared = _read_declarations(receiver)
+        declared = _read_declared_sending(receiver)
         for i, name in enumerate(receiver.received_names):
             arrived_in_row = ~np.isnan(z[:, i])
             # Numbers that come with the values, such as a mode, stand behind those that shares are of.
@@ -267,7 +267,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     return links
 
 
-class _Declarations(NamedTuple):
+class _DeclaredSending(NamedTuple):
     """What the network says of a node's messages.
 
     period: rows between two, of a sender that declares it (`Periodic`); None of others. may_be_lost: whether some may
@@ -279,16 +279,16 @@ class _Declarations(NamedTuple):
     shares: Any
 
 
-def _read_declarations(receiver: Any) -> _Declarations:
+def _read_declared_sending(receiver: Any) -> _DeclaredSending:
     """Return what the network says of a node's messages."""
     if not isinstance(receiver, Node):
-        return _Declarations(period=None, may_be_lost=not receiver.complete, shares=None)
+        return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
     shares = _find_arrival_probabilities(receiver)
     # A node with a periodic sender is never complete: there only the channel says whether what is sent may be lost.
     if isinstance(receiver.trigger, Periodic):
         may_be_lost = first(receiver.channel).erases
-        return _Declarations(period=int(receiver.trigger.period), may_be_lost=may_be_lost, shares=shares)
-    return _Declarations(period=None, may_be_lost=not receiver.complete, shares=shares)
+        return _DeclaredSending(period=int(receiver.trigger.period), may_be_lost=may_be_lost, shares=shares)
+    return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=shares)
 
 
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:

@@ -12,7 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from heliograph.disk.palette import COLOURS as COLOURS
+from heliograph.disk.colours_of_figures import COLOURS as COLOURS
 from heliograph.numerics.check import check_count, instance
 
 INK, PALE, GRID = "#1f2933", "#bcc4cd", "#e4e7eb"

@@ -11,7 +11,7 @@ from heliograph.simulation.node import Node
 DRAWS = 20_000  # the median of this many is known to 1 % of a deviation
 
 
-def find_law_medians(
+def compute_innovation_medians(
     network: Network, node: str, variance: Float[np.ndarray, " received"]
 ) -> Float[np.ndarray, " received"]:
     """Return the median of an innovation under the node's own law, by received number; 0 where the law is symmetric.
@@ -28,7 +28,7 @@ def find_law_medians(
     if node == Network.FUSED:
         ends = np.cumsum([network.nodes[name].received for name in network.names])
         of_nodes = zip(network.names, np.split(variance, ends[:-1]), strict=True)
-        return np.concatenate([find_law_medians(network, name, of_node) for name, of_node in of_nodes])
+        return np.concatenate([compute_innovation_medians(network, name, of_node) for name, of_node in of_nodes])
     receiver = network.nodes[node]
     if not isinstance(receiver, Node):
         return np.zeros(receiver.received)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.report.figures import COLOURS, INK, STYLE, WIDTH, place_legend_above
 from heliograph.simulation.results.record import Record
 
@@ -45,7 +45,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
         if estimate.claim != "none":
             covariance = np.asarray(estimate.covariance)
             for k in np.unique(np.linspace(0, len(mean) - 1, ELLIPSES).astype(int)):
-                _add_ellipse(axes, mean[k], covariance[k][np.ix_([i, j], [i, j])], colour)
+                _draw_ellipse(axes, mean[k], covariance[k][np.ix_([i, j], [i, j])], colour)
     if record.truth is not None:
         axes.plot(record.truth[:, i], record.truth[:, j], color=INK, linestyle=":", label="truth")
     axes.set_aspect("equal", adjustable="datalim")
@@ -55,7 +55,7 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
     return figure
 
 
-def _add_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
+def _draw_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np.ndarray, colour: str) -> None:
     """Draw the ellipse (p - m)' P^-1 (p - m) = SIGMAS^2 of centre m and covariance P; nothing if P is not one."""
     if not (np.isfinite(covariance).all() and np.isfinite(center).all()):
         return

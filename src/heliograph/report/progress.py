@@ -20,7 +20,7 @@ class Advance(Protocol):
 
 
 @contextmanager
-def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
+def _show_bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
     """Show a bar on stderr with the current stage and `more` columns in the block; nothing without a terminal."""
     console = rich.console.Console(stderr=True)
     columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
@@ -31,7 +31,7 @@ def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress
 @contextmanager
 def progress(stages: int) -> Iterator[Advance]:
     """Show a progress bar over stages of work; a new name begins the next stage and completes those before."""
-    with _bar(rich.progress.TimeElapsedColumn()) as bar:
+    with _show_bar(rich.progress.TimeElapsedColumn()) as bar:
         task = bar.add_task("starting", total=stages)
         stage, begun = "", 0
 
@@ -107,7 +107,7 @@ def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], N
         rich.progress.TextColumn("{task.fields[left]}"),
     )
     last_line = time.monotonic()
-    with _bar(*columns) as bar:
+    with _show_bar(*columns) as bar:
         task = bar.add_task("starting", total=1, left="")
 
         def show(what: str, done: int, total: int) -> None:

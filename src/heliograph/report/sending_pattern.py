@@ -12,7 +12,7 @@ LONGEST = 256  # rows after which a pattern returns, at most
 CHANCE = 1e-4  # that losses at random are taken for a pattern, at most
 
 
-class Pattern(NamedTuple):
+class SendingPattern(NamedTuple):
     """A sender that is due in `due` of `length` rows, in `rows` (time,) of the table."""
 
     due: int
@@ -20,7 +20,7 @@ class Pattern(NamedTuple):
     rows: Bool[np.ndarray, " time"]
 
 
-def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
+def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
     """Return the pattern of rows in which a message is due, if losses at random would hardly leave it; else None.
 
     What is due in some of each `length` rows leaves the other rows empty for ever. Of the messages that are due some
@@ -33,14 +33,14 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> Pattern | None:
         turns = len(places) // np.gcd(due, len(places))
         due, length = int(places.sum()) * due * turns // len(places), length * turns
         rows[rows] = np.resize(places, int(rows.sum()))
-    return None if length == 1 else Pattern(due, length, rows)
+    return None if length == 1 else SendingPattern(due, length, rows)
 
 
 def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " length"] | None:
     """Return the pattern that chance makes least, as which of its rows are due; None where chance may make each."""
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
-    law = LossLaw.of_intervals(intervals)
+    law = BurstLossLaw.fit_to_intervals(intervals)
     least, found = np.log(CHANCE), None
     for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
         places = np.bincount(arrivals % length, minlength=length) > 0
@@ -58,7 +58,7 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     return found
 
 
-class LossLaw(NamedTuple):
+class BurstLossLaw(NamedTuple):
     """Law of the intervals between arrivals where losses come in bursts.
 
     Losses in bursts (a Markov chain of two states; those independent of each other are a case of it) make intervals
@@ -69,10 +69,10 @@ class LossLaw(NamedTuple):
     ends: float
 
     @staticmethod
-    def of_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "LossLaw":
+    def fit_to_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "BurstLossLaw":
         """Return the law of the greatest likelihood: shares of arrivals after an arrival, and of losses that end."""
         losses = intervals[intervals > 1] - 1
-        return LossLaw(
+        return BurstLossLaw(
             follows=1 - len(losses) / max(len(intervals), 1),
             ends=len(losses) / losses.sum() if len(losses) else 1.0,
         )
@@ -86,9 +86,9 @@ class LossLaw(NamedTuple):
         stay(first) / z^count (Chernoff). The best z is about the share of the rows that are not due, inverted.
         """
         share = max(float(np.mean(due)), 1 / len(due))
-        return min(self._log_moment(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
+        return min(self._log_mean_of_powers(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
 
-    def _log_moment(self, due: Bool[np.ndarray, " rows"], log_z: float, count: int) -> float:
+    def _log_mean_of_powers(self, due: Bool[np.ndarray, " rows"], log_z: float, count: int) -> float:
         """Return log(stay(first) / z^count), by the recursion of `log_chance_within`; numbers are scaled to about 1."""
         z, logarithm, stay, after, later = exp(log_z), 0.0, 1.0, 1.0, 1.0
         for is_due in due[-2::-1].tolist():
@@ -106,7 +106,7 @@ class LossLaw(NamedTuple):
         return logarithm + (log(now) if now > 0 else -np.inf) - count * log_z
 
 
-def _bound_log_chance(places: Bool[np.ndarray, " length"], law: LossLaw, count: int) -> float:
+def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, count: int) -> float:
     """Return an upper bound of the log probability that losses in bursts let nothing arrive outside of these places.
 
     The row of an arrival, modulo the pattern's length, moves as a Markov chain. The probability that N moves all end in

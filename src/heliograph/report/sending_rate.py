@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.types import Bool, Float, Int
-from heliograph.report.sending_pattern import CHANCE, LossLaw
+from heliograph.report.sending_pattern import CHANCE, BurstLossLaw
 
 PEAKS = 8  # of the spectrum of arrivals that are looked at
 FEWEST = 8  # arrivals from which a rate is looked for
@@ -16,7 +16,7 @@ LINE_PARAMETERS = 5  # rate, phase, width, first and last row: N rows tell some 
 OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
 
 
-class Rate(NamedTuple):
+class SendingRate(NamedTuple):
     """A sender that is due once in each `period` rows, a real number; `slots` numbers the arrivals among what was due.
 
     Shapes: slots (arrivals,).
@@ -26,7 +26,7 @@ class Rate(NamedTuple):
     slots: Int[np.ndarray, " arrivals"]
 
 
-class _Line(NamedTuple):
+class _PeriodicRows(NamedTuple):
     """Rows r that come right after a multiple of the period: frac(frequency r - start) at most `width`."""
 
     frequency: float
@@ -38,24 +38,24 @@ class _Line(NamedTuple):
         return np.asarray(self.frequency * rows - self.start)
 
 
-def find_rate(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
+def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     """Return the rate of a sender whose clock is not that of the rows, if losses would hardly leave it; else None.
 
     A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
     others are empty for ever (frac is the part after the point). If it is hardly slower than the rows the empty ones
     are rare, and have a rate themselves: one of each 1 / (1 - 1 / T) rows, and no such slot without its empty row.
     """
-    rate = _find_line(arrived)
+    rate = _find_slowest_rate(arrived)
     if rate is not None:
         return rate
     rows = np.flatnonzero(arrived)
-    rate_of_empty = _find_line(~arrived[rows[0] : rows[-1]]) if len(rows) else None
+    rate_of_empty = _find_slowest_rate(~arrived[rows[0] : rows[-1]]) if len(rows) else None
     if rate_of_empty is None or np.any(np.diff(rate_of_empty.slots) > 1):
         return None
-    return Rate(period=1 / (1 - 1 / rate_of_empty.period), slots=np.arange(np.count_nonzero(arrived)))
+    return SendingRate(period=1 / (1 - 1 / rate_of_empty.period), slots=np.arange(np.count_nonzero(arrived)))
 
 
-def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
+def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
 
     A sender may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. A line is
@@ -66,16 +66,16 @@ def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
     came_in_each_row = len(rows) == span
     if len(rows) < FEWEST or came_in_each_row:
         return None
-    loss_law, found = LossLaw.of_intervals(np.diff(rows)), None
+    loss_law, found = BurstLossLaw.fit_to_intervals(np.diff(rows)), None
     deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
     arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
-    for frequency in _find_peaks(arrived):
+    for frequency in _find_likely_frequencies(arrived):
         # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
-        _, gap = _find_gap(frequency, rows)
+        _, gap = _find_largest_gap(frequency, rows)
         if gap < 1 - frequency - OFF:
             continue
         # Each arrival has to be in a period of its own.
-        line = _find_narrowest_line(frequency, rows)
+        line = _fit_periodic_rows(frequency, rows)
         slots = np.floor(line.phases(rows)).astype(np.int64)
         if line.width >= 1 or np.any(np.diff(slots) < 1):
             continue
@@ -85,11 +85,11 @@ def _find_line(arrived: Bool[np.ndarray, " time"]) -> Rate | None:
         log_chance = loss_law.log_chance_within(due, arrivals_after_first) + log_number_of_lines
         # Multiples of a frequency that passes do so too: the least is the sender's.
         if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
-            found = Rate(period=1 / line.frequency, slots=slots - slots[0])
+            found = SendingRate(period=1 / line.frequency, slots=slots - slots[0])
     return found
 
 
-def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
+def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     """Return frequencies to look at, in periods a row: of usual intervals, and of the largest peaks of the spectrum.
 
     A spectrum does not tell a frequency f from 1 - f: both are returned.
@@ -105,7 +105,7 @@ def _find_peaks(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     return [*usual, *(frequency for f in largest.tolist() for frequency in (f, 1 - f))]
 
 
-def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
+def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
     """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls."""
     phases = np.sort(np.mod(frequency * rows, 1))
     gaps = np.diff(phases, append=phases[0] + 1)  # the last one goes around the circle, to the first phase
@@ -113,12 +113,12 @@ def _find_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[flo
     return float(phases[largest] + gaps[largest] / 2), float(gaps[largest])
 
 
-def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _Line:
+def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows:
     """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
 
     Then the width is a convex function of the frequency: thirds that cannot hold its minimum are cut off.
     """
-    middle, _ = _find_gap(frequency, rows)
+    middle, _ = _find_largest_gap(frequency, rows)
     whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
 
     def width(f: float) -> float:
@@ -131,4 +131,4 @@ def _find_narrowest_line(frequency: float, rows: Int[np.ndarray, " arrivals"]) -
         left, right = low + (high - low) / 3, high - (high - low) / 3
         low, high = (low, right) if width(left) <= width(right) else (left, high)
     best = (low + high) / 2
-    return _Line(frequency=best, start=float(np.min(best * rows - whole_periods)), width=width(best))
+    return _PeriodicRows(frequency=best, start=float(np.min(best * rows - whole_periods)), width=width(best))

@@ -202,7 +202,7 @@ async def _watching(settings: ServiceSettings) -> AsyncIterator[WrapService]:
     from heliograph.serving.observation.watch import watch_of
 
     table = settings.sources
-    uncounted = set() if table is None else Sources(table, settings.network).uncounted
+    uncounted = set() if table is None else Sources(table, settings.network).nodes_without_count
     watch = watch_of(settings.network, settings.name, uncounted)
     async with serve_page(watch, parse_page_address(settings.page, hosts=settings.hosts)):
         yield watch.wrap

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from heliograph.files.availability import DeviceStatuses
+from heliograph.files.device_availability import DeviceStatuses
 from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
@@ -44,7 +44,7 @@ class LastWordsService:
     def _keep_words(self) -> None:
         """Store the words that came since the last call."""
         # Words stay unkept until the store has them: it may be away, and raise.
-        self._unkept |= self._words.take_changed_words()
+        self._unkept |= self._words.pop_changed_words()
         if self._unkept:
             self._store.keep_words(self._unkept)
             self._unkept = {}

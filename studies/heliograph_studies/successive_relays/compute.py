@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.files.estimates.table import write_estimates
+from heliograph.files.estimates.estimates_table import write_estimates
 from heliograph.relays import RelayDesign
 from heliograph.relays.design import GainsByFilter
 from heliograph_studies import Stages, Unlisted

@@ -30,8 +30,8 @@ def test_a_query_gives_columns_with_every_digit_of_time():
     np.testing.assert_array_equal(columns["time"].astype(int), [1700000000000000001, 1700000001000000000])
     np.testing.assert_array_equal(columns["level"], [1.5, np.nan])
     np.testing.assert_array_equal(columns["pump"], [1, 0])
-    ((path, asked, login, _),) = server.asked
-    assert (path, login) == ("/query", None)
+    ((path, asked, user_and_password, _),) = server.asked
+    assert (path, user_and_password) == ("/query", None)
     assert asked == {
         "db": ["plant"],
         "q": ["SELECT level, pump FROM tank WHERE level > 1 & level < 2"],

@@ -80,18 +80,18 @@ def test_rows_of_sql_are_columns():
     )
     np.testing.assert_array_equal(columns["level"], [1.5, np.nan])
     np.testing.assert_array_equal(columns["pump"], [1, 0])
-    ((path, asked, login, _),) = server.asked
+    ((path, asked, user_and_password, _),) = server.asked
     statement = "SELECT time, level, pump FROM tank WHERE level < 2 & TRUE"
-    assert (path, login) == ("/api/v3/query_sql", "Bearer to&ken")
+    assert (path, user_and_password) == ("/api/v3/query_sql", "Bearer to&ken")
     assert asked == {"db": ["plant"], "q": [statement], "format": ["json"]}
 
 
 @pytest.mark.parametrize(
-    ("login", "sent"), [("", None), (":to%26ken@", "Token to&ken"), ("me:secret@", "Token me:secret")]
+    ("user_and_password", "sent"), [("", None), (":to%26ken@", "Token to&ken"), ("me:secret@", "Token me:secret")]
 )
-def test_flux_is_asked_by_a_token(login, sent):
+def test_flux_is_asked_by_a_token(user_and_password, sent):
     with Answering(UNTAGGED.encode()) as server:
-        hg.files.read_store(f"{server.url.replace('//', f'//{login}')}?flux={ASKED}")
+        hg.files.read_store(f"{server.url.replace('//', f'//{user_and_password}')}?flux={ASKED}")
     assert server.asked[0][2] == sent
 
 

@@ -11,8 +11,8 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.report import Arrivals, FilterHealth, examine, run_figures, run_page, run_summary
-from heliograph.report.outputs import compare_with_truth, round_to
 from heliograph.report.pages.run import make_errors_table
+from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 from heliograph.simulation.results.whiteness import MemoryTest
 from tests.losing import Tied
 
@@ -92,7 +92,7 @@ def test_a_filter_that_lost_its_covariance_claims_nothing_on_the_page():
     record = hg.run(network, {"a": z}, truth=np.zeros((30, 2)))
     health_ = examine(network, record, np.zeros((30, 0)))
     claims = {item.filter: item.claim for item in health_.filters}
-    of_errors = {item.filter: item.claim for item in compare_with_truth(record)}
+    of_errors = {item.filter: item.claim for item in compute_filter_errors(record)}
     summary = run_summary(health_)["filters"]["a"]
     expected = {"losing": "none", "kalman": "exact"}
     assert claims == of_errors == {name: part["claim"] for name, part in summary.items()} == expected

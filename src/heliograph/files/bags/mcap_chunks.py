@@ -1,4 +1,4 @@
-"""Messages of an indexed MCAP file, a chunk at a time: a quarter of the time of a record at a time."""
+"""Messages of an indexed MCAP file, read a chunk at a time, which takes a quarter of the time of a record at a time."""
 
 import struct
 from bisect import bisect_left
@@ -7,7 +7,7 @@ from itertools import accumulate
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from heliograph.files.bags.message_layout import RawMessage
+from heliograph.files.bags.batch_decoder import RawMessage
 
 if TYPE_CHECKING:  # an extra
     from rosbags.highlevel import AnyReader
@@ -59,14 +59,14 @@ def _merge_chunks(
     earliest = [*accumulate(reversed(starts), min)][::-1]  # the earliest time of each chunk and all after it
     waiting: list[RawMessage] = []
     for chunk, next_start in zip(chunks, [*earliest[1:], None], strict=True):
-        waiting = sorted([*waiting, *_read_chunk(storage, chunk, channels)], key=attrgetter("logged"))
+        waiting = sorted([*waiting, *_yield_messages_of_chunk(storage, chunk, channels)], key=attrgetter("logged"))
         # Those before the earliest that a later chunk may hold.
         ready = len(waiting) if next_start is None else bisect_left(waiting, next_start, key=attrgetter("logged"))
         yield from waiting[:ready]
         waiting = waiting[ready:]
 
 
-def _read_chunk(
+def _yield_messages_of_chunk(
     storage: "McapReader", chunk: "ChunkInfo", channels: "Mapping[int, Connection]"
 ) -> Iterator[RawMessage]:
     """Yield the messages of one chunk, as they stand in it.

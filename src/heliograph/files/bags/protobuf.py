@@ -25,7 +25,7 @@ def _decode_signed(number: int) -> int:
     return number - (1 << 64) if number >> 63 else number
 
 
-class Scalar(NamedTuple):
+class ScalarReader(NamedTuple):
     """How a type of number is read: its wire type, and what makes the number of it."""
 
     wire: int
@@ -33,30 +33,30 @@ class Scalar(NamedTuple):
 
 
 def _make_fixed_reader(layout: str) -> Callable[[bytes], Any]:
-    """Return what reads a number of fixed length."""
+    """Return a function from the bytes of a number of fixed length to the number; `layout` is a format of `struct`."""
     return lambda data: struct.unpack(layout, data)[0]
 
 
 SCALARS = {  # by type of FieldDescriptorProto
-    1: Scalar(FIXED64, _make_fixed_reader("<d")),
-    2: Scalar(FIXED32, _make_fixed_reader("<f")),
-    3: Scalar(VARINT, _decode_signed),
-    4: Scalar(VARINT, int),
-    5: Scalar(VARINT, _decode_signed),
-    6: Scalar(FIXED64, _make_fixed_reader("<Q")),
-    7: Scalar(FIXED32, _make_fixed_reader("<I")),
-    8: Scalar(VARINT, bool),
-    13: Scalar(VARINT, int),
-    15: Scalar(FIXED32, _make_fixed_reader("<i")),
-    16: Scalar(FIXED64, _make_fixed_reader("<q")),
-    17: Scalar(VARINT, _decode_zigzag),
-    18: Scalar(VARINT, _decode_zigzag),
+    1: ScalarReader(FIXED64, _make_fixed_reader("<d")),
+    2: ScalarReader(FIXED32, _make_fixed_reader("<f")),
+    3: ScalarReader(VARINT, _decode_signed),
+    4: ScalarReader(VARINT, int),
+    5: ScalarReader(VARINT, _decode_signed),
+    6: ScalarReader(FIXED64, _make_fixed_reader("<Q")),
+    7: ScalarReader(FIXED32, _make_fixed_reader("<I")),
+    8: ScalarReader(VARINT, bool),
+    13: ScalarReader(VARINT, int),
+    15: ScalarReader(FIXED32, _make_fixed_reader("<i")),
+    16: ScalarReader(FIXED64, _make_fixed_reader("<q")),
+    17: ScalarReader(VARINT, _decode_zigzag),
+    18: ScalarReader(VARINT, _decode_zigzag),
 }
 LENGTHS = {FIXED64: 8, FIXED32: 4}
 
 
-class Field(NamedTuple):
-    """A field of a message.
+class FieldDescriptor(NamedTuple):
+    """A field of a type of Protocol Buffers messages, as the schema describes it.
 
     Args:
         name: as the schema writes it.
@@ -74,26 +74,26 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Schema:
-    """Types that a file describes.
+class ProtobufSchema:
+    """Message types and enumerations of Protocol Buffers that a file describes, by which messages are decoded.
 
     Args:
         messages: fields of each message by their numbers, by the message's full name.
         enums: names of the values of each enumeration, by its full name.
     """
 
-    messages: dict[str, dict[int, Field]]
+    messages: dict[str, dict[int, FieldDescriptor]]
     enums: dict[str, dict[int, str]]
 
     @staticmethod
-    def of(data: bytes) -> "Schema":
+    def of(data: bytes) -> "ProtobufSchema":
         """Read a FileDescriptorSet, by the numbers of descriptor.proto; raise ValueError at what is none."""
-        schema = Schema({}, {})
-        for file in _select_fields(data, 1):
+        schema = ProtobufSchema({}, {})
+        for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
             for number, add in ((4, schema._add_message_type), (5, schema._add_enum)):
-                for content in _select_fields(file, number):
+                for content in _list_values_of_field(file, number):
                     add(content, f"{package}." if package else "", syntax == "proto3")
         return schema
 
@@ -105,12 +105,12 @@ class Schema:
             prefix: full name of what it stands in, with a dot.
             implicit: whether an absent field has its default, as in proto3.
         """
-        name, fields = prefix + _read_text_field(data, 1), dict[int, Field]()
-        for content in _select_fields(data, 2):
+        name, fields = prefix + _read_text_field(data, 1), dict[int, FieldDescriptor]()
+        for content in _list_values_of_field(data, 2):
             found = {number: value for number, _, value in read_fields(content)}
             # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
-            fields[int(found[3])] = Field(
+            fields[int(found[3])] = FieldDescriptor(
                 name=_decode_text(found[1]),
                 kind=int(found[5]),
                 of=_decode_text(found.get(6, b"")).removeprefix("."),
@@ -119,12 +119,14 @@ class Schema:
             )
         self.messages[name] = fields
         for number, add in ((3, self._add_message_type), (4, self._add_enum)):
-            for content in _select_fields(data, number):
+            for content in _list_values_of_field(data, number):
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
         """Read the descriptor of an enumeration into the table of the schema; `implicit`: not used of one."""
-        values = [{number: value for number, _, value in read_fields(content)} for content in _select_fields(data, 2)]
+        values = [
+            {number: value for number, _, value in read_fields(content)} for content in _list_values_of_field(data, 2)
+        ]
         names = {_decode_signed(int(found.get(2, 0))): _decode_text(found[1]) for found in values}
         self.enums[prefix + _read_text_field(data, 1)] = names
 
@@ -158,7 +160,7 @@ class Schema:
                 content[field.name] = values[-1]
         return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
 
-    def _read_value(self, field: Field, value: Any, depth: int) -> Any:
+    def _read_value(self, field: FieldDescriptor, value: Any, depth: int) -> Any:
         """Return a value of a field as JSON has it."""
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
@@ -168,8 +170,8 @@ class Schema:
             return _decode_text(value)
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
-    def _choose_default(self, field: Field) -> Any:
-        """Return what an absent field stands for."""
+    def _choose_default(self, field: FieldDescriptor) -> Any:
+        """Return the value of a field that a message leaves out: 0, false, "", a name of an enumeration, or None."""
         if field.kind == ENUM:
             return self.enums.get(field.of, {}).get(0, 0)
         if field.kind in (TEXT, BYTES):
@@ -211,7 +213,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     raise ValueError("no message of Protocol Buffers, or one that was cut off")
 
 
-def _split_packed(field: Field, wire: int, value: Wire) -> list[Wire]:
+def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
     """Return the values of a field as they stand: of a packed list several.
 
     Args:
@@ -240,7 +242,7 @@ def _split_packed(field: Field, wire: int, value: Wire) -> list[Wire]:
     return values
 
 
-def _find_wire_type(field: Field) -> int:
+def _find_wire_type(field: FieldDescriptor) -> int:
     """Return the wire type that stands before a field's value; raise ValueError at a type that is not read."""
     if field.kind in (TEXT, BYTES, MESSAGE):
         return SIZED
@@ -251,14 +253,14 @@ def _find_wire_type(field: Field) -> int:
     return SCALARS[field.kind].wire
 
 
-def _select_fields(data: bytes, wanted: int) -> list[bytes]:
+def _list_values_of_field(data: bytes, wanted: int) -> list[bytes]:
     """Return the messages or texts in the fields of a number."""
     return [value for number, _, value in read_fields(data) if number == wanted and isinstance(value, bytes)]
 
 
 def _read_text_field(data: bytes, number: int) -> str:
     """Return the text in the last field of a number; "" where there is none."""
-    return _decode_text((_select_fields(data, number) or [b""])[-1])
+    return _decode_text((_list_values_of_field(data, number) or [b""])[-1])
 
 
 def _decode_text(value: Any) -> str:

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heliograph.files.logs.log import Log, Series, Wanted, merge_series
 from heliograph.files.logs.log_sources import LogSources
+from heliograph.files.logs.vehicle_log import Log, MessageSeries, Wanted, merge_series
 from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def _list_units(file: "MDF", group: int) -> dict[str, str]:
     return {c.name: file.get_channel_unit(c.name, group=group, index=i) or "" for i, c in channels if i != master}
 
 
-def _read_group(file: "MDF", group: int, names: dict[str, str]) -> Series:
+def _read_group(file: "MDF", group: int, names: dict[str, str]) -> MessageSeries:
     """Return the times and signals of a group.
 
     A sample that the file marks as invalid is None; signals of several numbers a sample are left out.
@@ -72,4 +72,4 @@ def _read_group(file: "MDF", group: int, names: dict[str, str]) -> Series:
             column = column.astype(object)
             column[np.asarray(signal.invalidation_bits, dtype=bool)] = None
         values[name] = column
-    return Series(time, values)
+    return MessageSeries(time, values)

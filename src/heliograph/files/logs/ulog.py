@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.files.logs.log import Log, Series, Wanted, merge_series
 from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.logs.vehicle_log import Log, MessageSeries, Wanted, merge_series
 from heliograph.numerics.check import error_text, fail
 
 if TYPE_CHECKING:
@@ -42,12 +42,12 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     # The units of a topic's fields, which a ULog file does not say; of the wanted ones their values over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
-        name: Series(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
+        name: MessageSeries(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
         for name, data in topics.items()
         if wanted(name)
     }
     # When the device began to run, in seconds since 1970; the sources may say when the log began, some time later.
-    begin = _find_date(file)
+    begin = _find_start_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND
     notes = list[str]()
@@ -58,7 +58,7 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
 
 
-def _find_date(file: "ULog") -> float:
+def _find_start_date(file: "ULog") -> float:
     """Return the date, in seconds since 1970, at which the device began to run; 0 if the log does not say it."""
     for data in file.data_list:
         if data.name in CLOCKS and DATE in data.data and len(known := np.flatnonzero(data.data[DATE])):

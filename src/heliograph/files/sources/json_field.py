@@ -8,10 +8,10 @@ from typing import Any, get_args
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.files.availability import Available
-from heliograph.files.sources.derived import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
-from heliograph.files.sources.fields import TimeUnit, convert_name, convert_time, field_at, parse_start
-from heliograph.model.checks.refusal_reasons import RefusedError
+from heliograph.files.device_availability import Available
+from heliograph.files.sources.computed_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
+from heliograph.files.sources.message_fields import TimeUnit, convert_name, convert_time, field_at, parse_start
+from heliograph.model.checks.refusals import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.dates import looks_like_date
@@ -286,18 +286,18 @@ def json_field(
     conditions, available = _split_conditions(where)
     return Source(
         paths=paths,
-        node=_check_name("node", node),
+        node=_parse_name_option("node", node),
         outputs=outputs,
         scale=factors,
         offset=shifts,
         time=stamp,
         time_unit=time_unit,
         sequence=count,
-        plant=None if plant_name is None else _check_name("plant", plant_name),
+        plant=None if plant_name is None else _parse_name_option("plant", plant_name),
         step=seconds,
         where=conditions,
         available=available,
-        valid=_read_valid(valid),
+        valid=_read_valid_flags(valid),
         quoted=flag("json_field, quoted", quoted),
     )
 
@@ -324,7 +324,7 @@ def read_paths(value: object) -> tuple[str | Computed, ...]:
     return tuple(items)
 
 
-def _check_name(name: str, value: object) -> Any:
+def _parse_name_option(name: str, value: object) -> Any:
     """Return what names a node or a plant (`name` says which); raise ValueError unless text, a Level or a Field."""
     if not isinstance(value, str | Level | Field):
         raise fail(f"json_field, {name}", "a text, hg.files.Level or hg.files.Field", show_value(value))
@@ -357,7 +357,7 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     return allowed_by_path, available
 
 
-def _read_valid(valid: object) -> Allowed:
+def _read_valid_flags(valid: object) -> Allowed:
     """Return the values of each flag by which a message says that it can be trusted."""
     if isinstance(valid, str):
         return {valid: (True, 1)}

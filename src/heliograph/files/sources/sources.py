@@ -7,19 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.availability import DeviceStatuses
-from heliograph.files.sources.clocks import TopicClocks
-from heliograph.files.sources.derived import Computed, ZeroIfAbsent
-from heliograph.files.sources.fields import (
+from heliograph.files.device_availability import DeviceStatuses
+from heliograph.files.sources.computed_values import Computed, ZeroIfAbsent
+from heliograph.files.sources.json_field import Field, Source
+from heliograph.files.sources.message_fields import (
     MissingFieldError,
     convert_count,
     convert_number,
     field_at,
     match_topic,
 )
-from heliograph.files.sources.json_field import Field, Source
-from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.sources.several_senders import SenderCounter
+from heliograph.files.sources.mixed_sender_detection import SenderCounter
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.topic_clocks import TopicClocks
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.model.plant import TIME_STEP
@@ -74,7 +74,7 @@ class Sources:
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
             raise fail("sources", "a dictionary of topics, each with json_field or a list of them", show_value(table))
-        self._table = {topic: self._check_sources(topic, items) for topic, items in table.items()}
+        self._table = {topic: self._map_sources(topic, items) for topic, items in table.items()}
         # By topic that came, found when first asked for: its sources, and the fields that they use.
         self._sources_of_topic = dict[str, list[MappedSource]]()
         self._fields_of_topic = dict[str, set[str]]()
@@ -92,7 +92,7 @@ class Sources:
         return list(self._table)
 
     @property
-    def subscribed(self) -> list[str]:
+    def subscribed_topics(self) -> list[str]:
         """Return the topics of the table, and those on which devices say whether they are online."""
         return list(dict.fromkeys([*self._table, *self.device_statuses.topics]))
 
@@ -103,28 +103,25 @@ class Sources:
         for counts, why in ((self.excluded, "left out by where="), (self.offline, "left out, of devices offline")):
             if counts:
                 named = ", ".join(f"{topic} ({number})" for topic, number in counts.most_common(LISTED))
-                lines.append(f"messages {why}: {named}{_count_more(len(counts))}")
-        if silent := self.device_statuses.unheard:
-            lines.append(f"no word of online or offline came: {', '.join(silent[:LISTED])}{_count_more(len(silent))}")
+                lines.append(f"messages {why}: {named}{_describe_rest(len(counts))}")
+        if silent := self.device_statuses.unheard_topics:
+            named = ", ".join(silent[:LISTED])
+            lines.append(f"no word of online or offline came: {named}{_describe_rest(len(silent))}")
         return lines
 
     @property
     def periods(self) -> dict[str, int]:
         """Return after how many messages the count of a node begins at 0 again, of nodes whose count does."""
-        mapped = [(source, places) for items in self._table.values() for source, _, places in items]
-        return {
-            node: source.sequence.period
-            for source, places in mapped
-            for node in places
-            if source.sequence is not None and source.sequence.period
-        }
+        mapped = [single for several in self._table.values() for single in several]
+        counts = [(node, single.source.sequence) for single in mapped for node in single.places]
+        return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
-    def uncounted(self) -> set[str]:
+    def nodes_without_count(self) -> set[str]:
         """Return the nodes whose messages carry no count, so that nothing is known of lost ones."""
-        mapped = [(source, places) for items in self._table.values() for source, _, places in items]
-        counted = {node for source, places in mapped for node in places if source.sequence is not None}
-        return {node for _, places in mapped for node in places} - counted
+        mapped = [single for several in self._table.values() for single in several]
+        counted = {node for single in mapped for node in single.places if single.source.sequence is not None}
+        return {node for single in mapped for node in single.places} - counted
 
     @property
     def columns(self) -> set[str]:
@@ -149,7 +146,7 @@ class Sources:
             self._sources_of_topic[topic] = [source for items in matching for source in items]
         return self._sources_of_topic[topic]
 
-    def take_word(self, topic: str, payload: object, where: str) -> bool:
+    def take_device_word(self, topic: str, payload: object, where: str) -> bool:
         """Note what a device says of itself, online or offline; return whether the message is such a word.
 
         Args:
@@ -160,7 +157,7 @@ class Sources:
         Raises:
             ValueError: a word that is neither online nor offline; one line.
         """
-        return self.device_statuses.take_last_word(topic, payload, where)
+        return self.device_statuses.take_status_message(topic, payload, where)
 
     def read(self, topic: str, message: object, where: str) -> list[Reading | Unread]:
         """Return a reading of a message for each source of its topic; [] of an unknown topic, which is counted.
@@ -183,7 +180,7 @@ class Sources:
                 results += [] if reading is None else [reading]
         return results
 
-    def date_as_original(self, reading: Reading, arrival: int | None) -> Reading:
+    def date_copy_as_original(self, reading: Reading, arrival: int | None) -> Reading:
         """Return a reading as it is; of a copy of the node's message before, with the time of that.
 
         A copy has the same count and values, and comes within ten seconds: gateways and senders repeat messages, and
@@ -293,16 +290,16 @@ class Sources:
         name = f"{where}, field {path!r}"
         return source.sequence.check(convert_count(value, name, source.quoted), name), False
 
-    def _check_sources(self, topic: object, items: object) -> list[MappedSource]:
+    def _map_sources(self, topic: object, items: object) -> list[MappedSource]:
         """Return the sources of a topic, checked, with the places of their values in each node's measurement."""
         if not isinstance(topic, str) or not topic:
             raise fail("sources", "topics that are text", show_value(topic))
         sources = [items] if isinstance(items, Source) else items
         if not isinstance(sources, Sequence) or not all(isinstance(s, Source) for s in sources) or not sources:
             raise fail(f"sources, {topic!r}", "json_field, or a list of them", show_value(items))
-        return [MappedSource(source, topic, self._place_outputs(topic, source)) for source in sources]
+        return [MappedSource(source, topic, self._find_output_places(topic, source)) for source in sources]
 
-    def _place_outputs(self, topic: str, source: Source) -> dict[str, np.ndarray]:
+    def _find_output_places(self, topic: str, source: Source) -> dict[str, np.ndarray]:
         """Return {node: which of its numbers each value of a source is, (values,)}.
 
         Raises:
@@ -375,7 +372,7 @@ def _read_time(source: Source, message: object, where: str) -> int | None:
     return None if source.time is None else source.time.of(message, source.time_unit, where, source.quoted)
 
 
-def _count_more(count: int) -> str:
+def _describe_rest(count: int) -> str:
     """Return how many of a list are not named in a line; "" if all are."""
     return "" if count <= LISTED else f" and {count - LISTED} more"
 

@@ -15,8 +15,13 @@ from urllib.parse import urlencode, urlsplit
 
 import numpy as np
 
-from heliograph.files.stores.address import StoreAddress
-from heliograph.files.stores.influx_answers import read_flux, read_influxql, read_sql_rows, shorten_line
+from heliograph.files.stores.influx_responses import (
+    parse_flux_response,
+    parse_influxql_response,
+    parse_sql_response,
+    shorten_answer,
+)
+from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
 PORT = 8086
@@ -24,7 +29,7 @@ SECONDS = 60.0  # until a server must answer
 BATCH = 4 * 2**20  # bytes of one request: a server may refuse more than ten million
 
 
-def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
+def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     """Return the measurement's name and the columns of a table: lists, and `time` as datetime64[ns].
 
     Several series, as of GROUP BY, are one table in the order of time, with their tags as columns.
@@ -35,12 +40,12 @@ def ask_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     query = address.query or f'SELECT * FROM "{_escape_name(address.table, chr(34))}"'
     match address.language:
         case "flux":
-            return read_flux(address, _send_request(address, "POST", *_make_flux_request(address)))
+            return parse_flux_response(address, _send_request(address, "POST", *_make_flux_request(address)))
         case "sql":
             target = urlencode({"db": address.database, "q": query, "format": "json"})
-            return read_sql_rows(address, _send_request(address, "GET", f"/api/v3/query_sql?{target}"))
+            return parse_sql_response(address, _send_request(address, "GET", f"/api/v3/query_sql?{target}"))
     answer = _send_request(address, "GET", f"/query?{urlencode({'db': address.database, 'q': query, 'epoch': 'ns'})}")
-    return read_influxql(address, answer)
+    return parse_influxql_response(address, answer)
 
 
 def _make_flux_request(address: StoreAddress) -> tuple[str, bytes]:
@@ -61,7 +66,7 @@ def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], momen
     """
     target = f"/write?{urlencode({'db': address.database, 'precision': 'ns'})}"
     done = 0
-    for body, rows in _batch_lines(address.written_table, columns, moments, plant):
+    for body, rows in _batch_protocol_lines(address.table_for_estimates, columns, moments, plant):
         try:
             _send_request(address, "POST", target, body)
         except InputError as error:
@@ -78,7 +83,7 @@ def check_influx(address: StoreAddress) -> None:
     _send_request(address, "GET", "/ping")
 
 
-def _batch_lines(
+def _batch_protocol_lines(
     table: str, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str
 ) -> Iterator[tuple[bytes, int]]:
     """Yield lines of the protocol in requests of a bounded size, each with its number of rows."""
@@ -86,7 +91,7 @@ def _batch_lines(
     names = [_escape_name(name, ", =") for name in columns]
     lines, size, rows = list[str](), 0, 0
     for time, *cells in zip(moments.astype(np.int64).tolist(), *(c.tolist() for c in columns.values()), strict=True):
-        fields = ",".join(f"{n}={_print_value(v)}" for n, v in zip(names, cells, strict=True) if isfinite(v))
+        fields = ",".join(f"{n}={_format_value(v)}" for n, v in zip(names, cells, strict=True) if isfinite(v))
         rows += 1
         if fields:  # a point without fields is none
             lines.append(f"{key} {fields} {time}\n")
@@ -98,7 +103,7 @@ def _batch_lines(
         yield "".join(lines).encode(), rows
 
 
-def _print_value(value: bool | float) -> str:
+def _format_value(value: bool | float) -> str:
     """Return a number with all its digits, or true or false."""
     return str(value).lower() if isinstance(value, bool) else repr(float(value))
 
@@ -129,7 +134,7 @@ def _send_request(address: StoreAddress, method: str, target: str, body: bytes |
         content, status = answer.read(), answer.status
     except (OSError, HTTPException) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise fail(str(address), "a server that answers", shorten_line(why)) from None
+        raise fail(str(address), "a server that answers", shorten_answer(why)) from None
     finally:
         connection.close()
     if status >= 300:
@@ -139,7 +144,7 @@ def _send_request(address: StoreAddress, method: str, target: str, body: bytes |
 
 def _make_headers(address: StoreAddress) -> dict[str, str]:
     """Return the headers of a request: a user with a password, or a token alone; of Flux also the types of content."""
-    user, password = address.login
+    user, password = address.user_and_password
     if address.language == "flux":
         token = f"{user}:{password}" if user else password  # version 1 takes both as one
         kinds = {"Content-Type": "application/json", "Accept": "application/csv"}
@@ -158,5 +163,5 @@ def _explain_refusal(content: bytes) -> str:
     except ValueError:
         found = None
     if isinstance(found, dict):
-        return shorten_line(str(found.get("error") or found.get("message") or answer))
-    return shorten_line(answer)
+        return shorten_answer(str(found.get("error") or found.get("message") or answer))
+    return shorten_answer(answer)

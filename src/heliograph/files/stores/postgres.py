@@ -7,7 +7,7 @@ import numpy as np
 import psycopg
 from psycopg import sql
 
-from heliograph.files.stores.address import StoreAddress
+from heliograph.files.stores.store_address import StoreAddress
 from heliograph.numerics.check import InputError, fail
 
 LONGEST = 63  # bytes of a column's name; what is longer would be cut
@@ -15,7 +15,7 @@ PLANT, TIME = "plant", "time"
 TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "double precision", "u": "double precision"}
 
 
-def ask_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
+def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     """Return the database's name and the columns of a table, as lists, asked for in a transaction that only reads.
 
     Raises:
@@ -60,7 +60,7 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
     if too_long is not None:
         raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(too_long))
     # The parts of the statements: the table, each column with its type, all their names.
-    table = sql.Identifier(*address.written_table.split("."))
+    table = sql.Identifier(*address.table_for_estimates.split("."))
     typed = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
     names = sql.SQL(", ").join(map(sql.Identifier, (PLANT, *columns)))
     cells = [_convert_cells(column) for column in columns.values()]

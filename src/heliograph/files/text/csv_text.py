@@ -5,15 +5,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from heliograph.disk.quoting import unquote_cell
-from heliograph.files.text.dialects import (
+from heliograph.disk.quoted_text import unquote_cell
+from heliograph.files.text.csv_dialects import (
     NO_VALUE,
     check_header,
     guess_meaning_of_cell,
     suggest_recoding,
     suggest_rewrite,
 )
-from heliograph.files.text.text_file import is_text, open_text
+from heliograph.files.text.text_file import is_valid_text, open_text
 from heliograph.numerics.check import InputError, fail, show_value
 
 ANNOTATIONS = ("#group", "#datatype", "#default", "#constant")  # of Influx's annotated CSV
@@ -69,13 +69,13 @@ class CsvReader:
         if not self._open_lines and '"' not in line:
             return self._make_row(line.rstrip("\r\n").split(","))
         self._open_lines.append(line)
-        return self._read_open_lines(ended=False)
+        return self._read_lines_of_open_quote(ended=False)
 
     def end(self) -> list[CsvRow | InputError]:
         """Return what is left at the end of the text."""
-        return self._read_open_lines(ended=True)
+        return self._read_lines_of_open_quote(ended=True)
 
-    def _read_open_lines(self, ended: bool) -> list[CsvRow | InputError]:
+    def _read_lines_of_open_quote(self, ended: bool) -> list[CsvRow | InputError]:
         """Return the rows of the lines since a quote was opened, once it is closed.
 
         Where it is not closed within OPEN lines, or at the end, its line is an error and the others are read anew.
@@ -117,13 +117,13 @@ class CsvReader:
             return []
         self.number += 1
         where = f"{self.source}, row {self.number}"
-        why = fail(where, "a row of CSV", broken) if broken else self._find_fault(where, cells)
+        why = fail(where, "a row of CSV", broken) if broken else self._find_row_error(where, cells)
         return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
 
-    def _find_fault(self, where: str, cells: list[str]) -> InputError | None:
+    def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
         """Return why cells are no row of this table; None if they are."""
         line = ",".join(cells)
-        if not is_text(line):
+        if not is_valid_text(line):
             return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{suggest_recoding(self.path, line)}")
         if line.lstrip().startswith("#") and not (self._marked and len(cells) == len(self.header)):
             remedy = "" if self.path is None else f": {suggest_rewrite(self.path, comment='#')}"

@@ -26,7 +26,7 @@ class CutOffError(InputError):
     """A text that ends before its end, or is damaged from somewhere on; what came before may be used."""
 
 
-def kind_of(path: Path) -> str:
+def find_extension(path: Path) -> str:
     """Return the extension of a file in small letters: before .gz where it is packed, ".csv" of a table in a .txt."""
     kind = (path.with_suffix("") if path.suffix.lower() == PACKED else path).suffix.lower()
     return ".csv" if kind == ".txt" and path.is_file() and _begins_as_table(path) else kind
@@ -56,7 +56,7 @@ def guess_encoding(start: bytes) -> str:
     return "utf-8-sig"
 
 
-def is_text(line: str) -> bool:
+def is_valid_text(line: str) -> bool:
     """Return whether a line was text, and not bytes that had to be escaped."""
     return (line.isascii() and "\0" not in line) or NO_TEXT.search(line) is None
 
@@ -94,11 +94,11 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
     total, rest, ended, damage = path.stat().st_size, b"", False, None
     with path.open("rb") as file, _open_unpacked(file) as unpacked:
         try:
-            decode = _choose_decoder(unpacked)
+            decode = _make_decoder_to_utf8(unpacked)
         except DAMAGE as error:
             raise _describe_damage(path, error) from None
         while not ended:
-            part, ended, damage = _read_part(unpacked, size)
+            part, ended, damage = _read_bytes_of_part(unpacked, size)
             text = rest + decode(part, ended and damage is None)
             end = len(text) if ended and damage is None else text.rfind(b"\n") + 1
             if progress is not None:
@@ -110,7 +110,7 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
         raise _describe_damage(path, damage)
 
 
-def _read_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
+def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
     """Return so many bytes, or those that are left; whether the file ends with them, and what is damaged there."""
     parts, length = list[bytes](), 0
     try:
@@ -128,7 +128,7 @@ def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
     return gzip.GzipFile(fileobj=file) if buffered.peek(len(GZIP)).startswith(GZIP) else buffered
 
 
-def _choose_decoder(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
+def _make_decoder_to_utf8(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
     """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8."""
     encoding = guess_encoding(text.peek(len(WIDE[0])))
     if encoding != "utf-8-sig":

@@ -38,7 +38,7 @@ class TextStream:
         self._decode: codecs.IncrementalDecoder | None = None
 
     @property
-    def more(self) -> bool:
+    def has_more(self) -> bool:
         """Return whether bytes wait to be unpacked, so that `feed` has text without more bytes."""
         return bool(self._packed) and not self.broken
 
@@ -52,9 +52,9 @@ class TextStream:
             self._start += data
             if len(self._start) < LONGEST_START and not ended and self._may_be_no_text(self._start):
                 return b""
-            data, self._start = self._choose_decoder(self._start), None
+            data, self._start = self._begin_decoding(self._start), None
         if self._inside is not None:
-            return self._inside.feed(self._unpack_bytes(data, ended), ended and not self.more)
+            return self._inside.feed(self._unpack_bytes(data, ended), ended and not self.has_more)
         if self._decode is not None:
             return self._decode.decode(data, ended).encode("utf-8", "replace")
         return data
@@ -65,7 +65,7 @@ class TextStream:
         marks = (*NO_TEXT, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
-    def _choose_decoder(self, start: bytes) -> bytes:
+    def _begin_decoding(self, start: bytes) -> bytes:
         """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8."""
         for mark, kind in NO_TEXT.items():
             if start.startswith(mark):

@@ -9,11 +9,11 @@ import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.report.figures import COLOURS, MUTED, STYLE, make_stacked_panels, place_legend_above
-from heliograph.report.outputs import round_to
 from heliograph.report.pages.page import Page, Picture, Points, Section, Table
-from heliograph.report.results import Json, Results
+from heliograph.report.results_folder import Json, ResultsContent
+from heliograph.report.sensor_output_health import round_to
 
 if TYPE_CHECKING:
     import heliograph
@@ -70,7 +70,7 @@ class FilterVerdict:
         return f"{self.name}: {failed}; furthest off {worst.describe()}."
 
 
-def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> Results:
+def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str, refit: int = 0) -> ResultsContent:
     """Return the content of the results folder of a backtest: its figure, page and summary.
 
     Args:
@@ -78,14 +78,14 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
         network: the user's name of the network.
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
-    return Results(
+    return ResultsContent(
         {"coverage": _draw_coverage(found)},
         lambda drawings: make_backtest_page(found, network, drawings, refit),
         _list_all_numbers(found) | ({"refit": refit} if refit else {}),
     )
 
 
-def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
+def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
     """Return the verdict on each filter by its intervals and what came, the largest share of misses first."""
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
@@ -96,9 +96,9 @@ def judge_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdic
     return sorted(verdicts, key=lambda v: -len(v.misses) / max(v.compared, 1))
 
 
-def list_doubts(found: "heliograph.forecasting.Backtest") -> list[str]:
+def describe_coverage_misses(found: "heliograph.forecasting.Backtest") -> list[str]:
     """Return a line for each coverage that is further from what was claimed than chance explains."""
-    return [f"{v.name}, {miss.describe()}" for v in judge_filters(found) for miss in v.misses]
+    return [f"{v.name}, {miss.describe()}" for v in judge_forecasts_of_filters(found) for miss in v.misses]
 
 
 @matplotlib.rc_context(STYLE)
@@ -145,7 +145,7 @@ def make_backtest_page(
         drawings: each figure as SVG.
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
-    verdicts = judge_filters(found)
+    verdicts = judge_forecasts_of_filters(found)
     lead = (
         f"From each of {found.rows:,} rows `{visible(network)}` forecast {', '.join(map(str, found.horizons))} rows "
         "ahead, as if nothing more arrived; scored is what came."
@@ -203,4 +203,9 @@ def _list_all_numbers(found: "heliograph.forecasting.Backtest") -> dict[str, Jso
         return float(value) if isinstance(value, float) and np.isfinite(value) else None
 
     scores: list[Json] = [{name: convert_to_json(value) for name, value in s.row().items()} for s in found.scores]
-    return {"rows": found.rows, "horizons": list(found.horizons), "warnings": list_doubts(found), "scores": scores}
+    return {
+        "rows": found.rows,
+        "horizons": list(found.horizons),
+        "warnings": describe_coverage_misses(found),
+        "scores": scores,
+    }

@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.numerics.confidence_intervals import round_to
+from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.numerics.counted_shares import round_to
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
-from heliograph.report.results import Json, Results
+from heliograph.report.results_folder import Json, ResultsContent
 
 MOST = 40  # transmitters that are drawn; the table and the summary hold all
 ROUNDING = 1e-12  # of the total power
@@ -48,10 +48,13 @@ class DesignResults:
     written: str
 
 
-def design_results(results: DesignResults) -> Results:
+def make_design_results(results: DesignResults) -> ResultsContent:
     """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
-    return Results(
-        draw_figures(results), partial(make_page, results), make_summary(results), partial(write_networks, results)
+    return ResultsContent(
+        draw_design_figures(results),
+        partial(make_design_page, results),
+        make_design_summary(results),
+        partial(write_networks, results),
     )
 
 
@@ -67,7 +70,7 @@ def compute_mean_powers(design: PowerDesign) -> dict[str, float]:
     return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
 
 
-def make_summary(results: DesignResults) -> dict[str, Json]:
+def make_design_summary(results: DesignResults) -> dict[str, Json]:
     """Return all numbers of the report of a design by name, as summary.json holds them."""
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
@@ -89,17 +92,17 @@ def make_summary(results: DesignResults) -> dict[str, Json]:
     }  # fmt: skip
 
 
-def draw_figures(results: DesignResults) -> dict[str, Figure]:
+def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
     """Return by file name the figures of the front, the powers, and the map if there is one."""
-    drawn = {"front": draw_front(results.front, {"this design": (results.design.total, results.design.error)})}
+    drawn = {"front": draw_pareto_front(results.front, {"this design": (results.design.total, results.design.error)})}
     drawn["powers"] = draw_powers(results.before, compute_mean_powers(results.design))
     if results.map is not None:
-        drawn["map"] = draw_map(results.map)
+        drawn["map"] = draw_error_map(results.map)
     return drawn
 
 
 @matplotlib.rc_context(STYLE)
-def draw_front(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
+def draw_pareto_front(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
     """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -139,7 +142,7 @@ def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figu
 
 
 @matplotlib.rc_context(STYLE)
-def draw_map(sites: SiteMap) -> Figure:
+def draw_error_map(sites: SiteMap) -> Figure:
     """Plot the error over places, darker where it is smaller, with the best place."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -152,7 +155,7 @@ def draw_map(sites: SiteMap) -> Figure:
     return figure
 
 
-def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
+def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the page of a design; `drawings` holds each figure as SVG."""
     design = results.design
     sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
@@ -160,17 +163,17 @@ def make_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
         sections.append(_make_map_section(drawings))
     return Page(
         kicker="Heliograph design",
-        title=_write_headline(results),
+        title=_make_headline(results),
         lead=(
             f"The network {visible(results.reference)} has the error {design.present:.4g} and sends "
             f"{sum(results.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
             f"{design.total:.4g}."
         ),
-        sections=[*sections, _make_changes_section(results), _explain_rerun()],
+        sections=[*sections, _make_changes_section(results), _explain_how_to_run()],
     )
 
 
-def _write_headline(results: DesignResults) -> str:
+def _make_headline(results: DesignResults) -> str:
     """Return the title: what the design saves, of error and of power."""
     design, before = results.design, sum(results.before.values())
     changes = []
@@ -236,7 +239,7 @@ def _make_changes_section(results: DesignResults) -> Section:
     return Section("What one more would buy", [Table(("change", unit, "saved"), rows, caption)])
 
 
-def _explain_rerun() -> Section:
+def _explain_how_to_run() -> Section:
     """Return how to run the designed network."""
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (

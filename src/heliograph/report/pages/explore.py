@@ -7,7 +7,7 @@ from importlib.resources import files
 
 from markupsafe import Markup
 
-from heliograph.report.pages.page import Page, make_environment
+from heliograph.report.pages.page import Page, make_template_environment
 
 LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")  # 1.4 MB without its widgets; Plotly's one file has 4.8 MB
 STATIC = "static"  # sections of this kind are seen in print, and where no script runs
@@ -52,21 +52,21 @@ class ExploredTable:
     unordered: str
 
 
-def explore_html(page: Page, tables: Sequence[ExploredTable]) -> str:
+def make_explorable_page_html(page: Page, tables: Sequence[ExploredTable]) -> str:
     """Return the page with tables to explore before its sections, as HTML that loads nothing else."""
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
-        make_environment()
+        make_template_environment()
         .get_template("explore.html.j2")
         .render(
             page=page,
             data=Markup(data.replace("<", "\\u003c")),  # no text can end the script
-            library=Markup("\n".join(_read_library(name) for name in LIBRARY)),
+            library=Markup("\n".join(_read_bokeh_script(name) for name in LIBRARY)),
             program=Markup(files("heliograph.report.pages").joinpath("explore.js").read_text(encoding="utf-8")),
         )
     )
 
 
-def _read_library(name: str) -> str:
+def _read_bokeh_script(name: str) -> str:
     """Return a script of the installed Bokeh, to be written into the page."""
     return files("bokeh").joinpath("server", "static", "js", name).read_text(encoding="utf-8")

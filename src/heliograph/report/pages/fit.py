@@ -10,7 +10,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.likelihood_maximum import Row
@@ -72,7 +72,7 @@ def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
         drawn["innovations"] = _draw_correlations(tested)
     received = [transforms for transforms in learned.uniform if np.any(~np.isnan(transforms.pit))][:MOST]
     if received:
-        drawn["pits"] = _draw_pits(received)
+        drawn["pits"] = _draw_probability_transforms(received)
     return drawn
 
 
@@ -131,7 +131,7 @@ def _draw_correlations(tested: list[Change]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _draw_pits(received: list[Uniformity]) -> Figure:
+def _draw_probability_transforms(received: list[Uniformity]) -> Figure:
     """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()
@@ -153,7 +153,7 @@ def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
     """Return the page of a fit; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
-        title=_write_headline(learned),
+        title=_make_headline(learned),
         lead=_summarise_gain(learned),
         sections=[
             Section("At a glance", _list_key_figures(learned)),
@@ -168,7 +168,7 @@ def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
     )  # fmt: skip
 
 
-def _write_headline(learned: FitResults) -> str:
+def _make_headline(learned: FitResults) -> str:
     """Return the title: how many numbers were learned."""
     rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"

@@ -215,10 +215,10 @@ class Page:
 
     def html(self) -> str:
         """Return the page as HTML that loads nothing else."""
-        return make_environment().get_template("page.html.j2").render(page=self)
+        return make_template_environment().get_template("page.html.j2").render(page=self)
 
 
-def make_environment() -> Environment:
+def make_template_environment() -> Environment:
     """Return the environment of this room's templates, in which all values are escaped."""
     templates = Environment(
         loader=PackageLoader("heliograph.report.pages", "."),

@@ -9,27 +9,25 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.numerics.check import instance
 from heliograph.numerics.times.dates import format_times
 from heliograph.report.figures import BLUE, GREEN, VERMILION, make_stacked_panels, place_legend_above
-from heliograph.report.forecasts import draw_forecasts, forecast_tables
-from heliograph.report.health import Health
-from heliograph.report.innovations import (
+from heliograph.report.forecast_figures import draw_forecasts, make_forecast_tables
+from heliograph.report.innovations_section import (
     BAND,
     COLOURS,
     LOOK,
     MOST,
     choose_picture,
     draw_innovations,
-    group_tested_by_figure,
+    group_tested_filters_by_figure,
     label_time_axis,
     make_innovations_section,
-    say_not_drawn,
+    name_undrawn_figures,
 )
-from heliograph.report.mode_probabilities import PREFIX, draw_modes_of_nodes
-from heliograph.report.outputs import compare_with_truth, round_to
-from heliograph.report.pages.links import draw_deliveries, make_links_blocks
+from heliograph.report.mode_probability_figures import PREFIX, draw_modes_of_nodes
+from heliograph.report.pages.links_section import draw_deliveries, make_links_blocks
 from heliograph.report.pages.page import (
     KeyFigure,
     KeyFigures,
@@ -41,10 +39,12 @@ from heliograph.report.pages.page import (
     Table,
     Text,
 )
-from heliograph.report.pages.predicted import draw_predicted_figures, make_predicted_sections
+from heliograph.report.pages.predictions import draw_predicted_figures, make_predicted_sections
 from heliograph.report.pages.run_summary import run_summary
 from heliograph.report.position_map import draw_position_map, find_coordinates
-from heliograph.report.results import Json, Results, write_into_folder
+from heliograph.report.recording_diagnosis import Health
+from heliograph.report.results_folder import Json, ResultsContent, write_into_folder
+from heliograph.report.sensor_output_health import compute_filter_errors, round_to
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 
@@ -53,12 +53,14 @@ FIRST = ("links", "innovations", "innovations_0", "map", "estimates_0")  # figur
 DOUBTS = 3  # that the page shows; `summary.json` has all
 
 
-def make_run_results(health: Health, network: str) -> Results:
+def make_run_results(health: Health, network: str) -> ResultsContent:
     """Return the content of the results folder; `network` is the user's name of the network."""
-    return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
+    return ResultsContent(
+        run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None
+    )
 
 
-def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Results:
+def make_results_of_plants(examined: Mapping[str, Health], network: str) -> ResultsContent:
     """Return the results of several plants: an overview, the most doubted first, and beside it a folder for each."""
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
@@ -70,7 +72,7 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
             write_into_folder(make_run_results(health, f"{network}, {plant}"), subfolder)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
-    return Results({}, lambda _: _make_overview(examined, network, folders), summary, write)
+    return ResultsContent({}, lambda _: _make_overview(examined, network, folders), summary, write)
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
@@ -105,19 +107,23 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
-            node = _nodes_to_draw(record)[0]
-            drawn[_map_name(kind)] = draw_position_map(record, node, list(record.estimates[node])[: len(COLOURS)])
+            node = _choose_nodes_to_draw(record)[0]
+            drawn[_name_position_map(kind)] = draw_position_map(
+                record, node, list(record.estimates[node])[: len(COLOURS)]
+            )
     for kind, record in _collect_estimates(health):
-        drawn |= {f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_nodes_to_draw(record))}
-        drawn |= draw_modes_of_nodes(record, kind, _nodes_to_draw(record))
-    drawn |= {name: draw_innovations(health, tested) for name, tested in group_tested_by_figure(health).items()}
+        drawn |= {
+            f"{kind}_{i}": _draw_estimates(health, record, node) for i, node in enumerate(_choose_nodes_to_draw(record))
+        }
+        drawn |= draw_modes_of_nodes(record, kind, _choose_nodes_to_draw(record))
+    drawn |= {name: draw_innovations(health, tested) for name, tested in group_tested_filters_by_figure(health).items()}
     drawn |= draw_predicted_figures(health)
     if health.links:
         drawn["links"] = draw_deliveries(health)
     return drawn
 
 
-def _map_name(kind: str) -> str:
+def _name_position_map(kind: str) -> str:
     """Return the name of the map of filtered or of smoothed estimates."""
     return "map" if kind == "estimates" else f"map_{kind}"
 
@@ -128,7 +134,7 @@ def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
     return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
 
 
-def _nodes_to_draw(record: Record) -> list[str]:
+def _choose_nodes_to_draw(record: Record) -> list[str]:
     """Return the nodes that are drawn, the fused estimate first."""
     return _sort_nodes(record)[:MOST]
 
@@ -171,14 +177,14 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         _make_key_figures(health, len(doubts)),
         *_list_doubts(doubts),
         *_list_baseline_remarks(health),
-        *_list_premises(health),
-        *_list_overloads(record),
+        *_list_filters_of_other_worlds(health),
+        *_describe_overloads(record),
     ]
-    forecasts = [Section("Forecasts", forecast_tables(record, health.forecasts))] if health.forecasts else []
+    forecasts = [Section("Forecasts", make_forecast_tables(record, health.forecasts))] if health.forecasts else []
     return Page(
         kicker=f"Heliograph run: {visible(network)}",
-        title=_find_headline(health),
-        lead=f"The filters of `{visible(network)}` ran over {rows}. {_describe_agreement(health, doubts)}",
+        title=_make_headline(health),
+        lead=f"The filters of `{visible(network)}` ran over {rows}. {_describe_number_of_doubts(health, doubts)}",
         sections=[
             Section("At a glance", glance),
             Section("Estimates", [*make_errors_table(record), *_list_pictures(health, drawings)]),
@@ -218,13 +224,13 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
     return kept
 
 
-def _find_headline(health: Health) -> str:
+def _make_headline(health: Health) -> str:
     """Return the title of a run's page: the last estimate of the filter that the network relies on.
 
     Its first two states, or its position, with bands where it claims a covariance.
     """
     record = health.record
-    nodes = _nodes_to_draw(record)
+    nodes = _choose_nodes_to_draw(record)
     if not nodes:
         return f"{len(record.time):,} rows were read"
     node = nodes[0]
@@ -250,9 +256,9 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
     """
     pictures: list[Picture | PictureChoice | Text] = []
     for kind, record in _collect_estimates(health):
-        nodes = _nodes_to_draw(record)  # the first few: estimates of others are in the record alone
+        nodes = _choose_nodes_to_draw(record)  # the first few: estimates of others are in the record alone
         added = ", given later data too" if kind == "smoothed" else ""
-        if (name := _map_name(kind)) in drawings:
+        if (name := _name_position_map(kind)) in drawings:
             text = f"The path that {visible(nodes[0])} estimates{added}"
             pictures.append(Picture(drawings[name], text, f"{text}, with ellipses of {BAND:g} claimed deviations."))
         estimates, modes = {}, {}
@@ -266,8 +272,8 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
                 modes[node] = Picture(drawings[name], title, f"{visible(node)}: probability of each mode{added}.")
         pictures += [*choose_picture(estimates), *choose_picture(modes)]
         too_large = [node for node in nodes if node not in estimates]  # to stand in the page, but drawn
-        pictures += say_not_drawn(too_large, f"Their figures are files beside this page ({kind}_0.svg and on).")
-        pictures += say_not_drawn(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
+        pictures += name_undrawn_figures(too_large, f"Their figures are files beside this page ({kind}_0.svg and on).")
+        pictures += name_undrawn_figures(_sort_nodes(record)[MOST:], "Their estimates are in the record.")
     return pictures
 
 
@@ -277,7 +283,7 @@ def make_errors_table(record: Record) -> list[Table]:
         [visible(f"{errors.node}/{errors.filter}"), errors.claim,
          *(round_to(value, errors.rmse_error[state]) for state, value in errors.rmse.items()),
          "–" if np.isnan(errors.nees) else round_to(errors.nees, errors.nees_error)]
-        for errors in compare_with_truth(record)
+        for errors in compute_filter_errors(record)
     ]  # fmt: skip
     caption = (
         "Root mean square error of each state against the truth in the recording, to two digits of its standard "
@@ -292,7 +298,7 @@ def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
     return f"{state} ({units[state]})" if state in units else state
 
 
-def _describe_agreement(health: Health, doubts: list[str]) -> str:
+def _describe_number_of_doubts(health: Health, doubts: list[str]) -> str:
     """Return the sentence on how many doubts there are about the network, or that there are none."""
     if doubts:
         return f"There {'is' if len(doubts) == 1 else 'are'} {_count_in_words(len(doubts), 'doubt')} about the network."
@@ -329,13 +335,13 @@ def _list_baseline_remarks(health: Health) -> list[Text | Points]:
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _list_premises(health: Health) -> list[Text | Points]:
+def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
     """Return the filters that were made for another world than that of their node."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []
 
 
-def _list_overloads(record: Record) -> list[Text | Points]:
+def _describe_overloads(record: Record) -> list[Text | Points]:
     """Return how often the words that filters take are overloaded, before any data."""
     lines = [
         visible(overload.describe(node, name))

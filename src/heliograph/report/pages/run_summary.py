@@ -4,9 +4,9 @@ import numpy as np
 
 from heliograph.numerics.check import instance
 from heliograph.report.arrivals import Arrivals
-from heliograph.report.health import FilterHealth, Health
-from heliograph.report.outputs import compare_with_truth, summarise_output
-from heliograph.report.results import Json
+from heliograph.report.recording_diagnosis import FilterHealth, Health
+from heliograph.report.results_folder import Json
+from heliograph.report.sensor_output_health import compute_filter_errors, summarise_output
 from heliograph.simulation.results.record import Record
 
 
@@ -78,7 +78,7 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 def _list_error_numbers(record: Record) -> dict[str, dict[str, Json]]:
     """Return RMSE by state and NEES of each filter, by node and filter; nothing where the truth is not known."""
     errors: dict[str, dict[str, Json]] = {}
-    for of_filter in compare_with_truth(record):
+    for of_filter in compute_filter_errors(record):
         size = None if np.isnan(of_filter.nees) else of_filter.nees
         rmse: dict[str, Json] = {state: None if np.isnan(x) else x for state, x in of_filter.rmse.items()}
         errors.setdefault(of_filter.node, {})[of_filter.filter] = {"rmse": rmse, "nees": size}

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from heliograph.files.messages.in_files import FileMessage, convert_line, decode_document
-from heliograph.files.messages.own_form import OwnReader, is_own
+from heliograph.files.messages.message_files import FileMessage, parse_message_document, parse_message_line
+from heliograph.files.messages.own_format import OwnMessageReader, is_own_message
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
@@ -63,7 +63,7 @@ class LineReader:
         # our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
-        self._own = OwnReader(network, self.source, ignore_unknown, table=False)
+        self._own = OwnMessageReader(network, self.source, ignore_unknown, table=False)
         self._table = TableLineReader(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended
@@ -111,14 +111,14 @@ class LineReader:
         if not isinstance(read, str | UnreadMessage):
             self._is_table = False
             return [read]
-        messages = convert_line(f"{self.source}, line {self._number}", _decode_line(line))
+        messages = parse_message_line(f"{self.source}, line {self._number}", _decode_line(line))
         return [payload for message in messages for payload in self._interpret_message(message, read)]
 
     def _read_document_or_lines(self, lines: list[bytes]) -> list[Payload]:
         """Return the messages of a JSON document of several lines, or else of each line by itself."""
         self._document = None
         with suppress(InputError):
-            found = decode_document(b"\n".join(lines), self.source)
+            found = parse_message_document(b"\n".join(lines), self.source)
             return [payload for message in found for payload in self._interpret_message(message, None)]
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()
@@ -138,7 +138,7 @@ class LineReader:
             return [str(message)]
         # Messages of others, by topic, are for the sources; those in our own form are tried as a service gets them, and
         # then as a file has them.
-        own = message.topic is None and is_own(message.content)
+        own = message.topic is None and is_own_message(message.content)
         if self._translator is not None and not own:
             self._is_table = False
             return [*self._translator.decode(message, self._topic)]

@@ -4,7 +4,7 @@ import asyncio
 import threading
 import time
 
-from heliograph.files.inspection import Topic, note_payload
+from heliograph.files.topic_inspection import TopicStatistics, note_payload
 from heliograph.numerics.check import fail
 from heliograph.serving.brokers.url import Address
 
@@ -12,7 +12,7 @@ WAIT = 10.0  # seconds that a connection may take
 INTERNAL = ("$", "_INBOX")  # topics and subjects of the broker itself
 
 
-def listen(address: Address, seconds: float) -> dict[str, Topic]:
+def listen(address: Address, seconds: float) -> dict[str, TopicStatistics]:
     """Listen to all topics of a broker for a while, and return them; nothing is acknowledged or stored.
 
     Args:
@@ -22,7 +22,7 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
     Raises:
         ValueError: no connection; one line that names the broker.
     """
-    topics: dict[str, Topic] = {}
+    topics: dict[str, TopicStatistics] = {}
     if address.kind == "opc.tcp":
         from heliograph.serving.brokers.opcua import Listener
 
@@ -36,7 +36,7 @@ def listen(address: Address, seconds: float) -> dict[str, Topic]:
     return topics
 
 
-def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+def _listen_mqtt(address: Address, seconds: float, topics: dict[str, TopicStatistics]) -> None:
     """Note all messages of an MQTT broker by topic for some seconds, except those that it had stored before.
 
     Args:
@@ -87,7 +87,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, Topic]) -> 
         client.loop_stop()
 
 
-async def _listen_nats(address: Address, seconds: float, topics: dict[str, Topic]) -> None:
+async def _listen_nats(address: Address, seconds: float, topics: dict[str, TopicStatistics]) -> None:
     """Note each message of a NATS server under its topic for some seconds.
 
     Args:

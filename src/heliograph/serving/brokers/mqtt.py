@@ -182,7 +182,7 @@ class _Reader(Connection):
         super().connected(client, data, flags, code, more)
         self._connection += 1
         if not code.is_failure:
-            topics = [] if self._translator is None else self._translator.sources.subscribed
+            topics = [] if self._translator is None else self._translator.sources.subscribed_topics
             LOG.info("%s: connected", self.address)
             client.subscribe([(topic, AT_LEAST_ONCE) for topic in (f"{self._prefix}{self._topics_below}", *topics)])
 

@@ -117,7 +117,7 @@ class Nats:
     @property
     def _source_subjects(self) -> list[str]:
         """Return the subjects of the sources, with the wildcards of NATS."""
-        topics = [] if self._translator is None else self._translator.sources.subscribed
+        topics = [] if self._translator is None else self._translator.sources.subscribed_topics
         return [topic.replace("/", ".").replace("+", "*").replace("#", ">") for topic in topics]
 
     async def _acknowledge(self, last: Msg) -> None:

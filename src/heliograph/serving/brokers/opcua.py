@@ -14,7 +14,7 @@ from asyncua import Client, Node, ua
 from asyncua.common.subscription import DataChangeNotif
 from asyncua.ua.uaerrors import UaError
 
-from heliograph.files.inspection import Topic, note_payload
+from heliograph.files.topic_inspection import TopicStatistics, note_payload
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, show_value, text
 from heliograph.serving.brokers.pipe import Pipe
@@ -186,7 +186,7 @@ class OpcUa:
         client = _make_client(self.address)
         await client.connect()
         self._client = client
-        for name in self._translator.sources.subscribed:
+        for name in self._translator.sources.subscribed_topics:
             node = _find_node(client, name)
             self._first.add(node.nodeid.to_string())
             self.reporting[name] = await _monitor(client, node, self)
@@ -198,7 +198,7 @@ class Listener:
     The first value of a variable was there before: it says nothing of rate and lateness.
     """
 
-    def __init__(self, topics: dict[str, Topic]):
+    def __init__(self, topics: dict[str, TopicStatistics]):
         self.topics, self.kinds = topics, dict[str, str]()
 
     async def listen(self, where: Address, seconds: float) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from heliograph.disk.whole_file import name_path_in_errors
+from heliograph.disk.atomic_files import name_path_in_errors
 from heliograph.files.text.text_stream import TextStream
 from heliograph.serving.brokers.transport import LOG, Batch, acknowledge_nothing
 from heliograph.serving.message import LONGEST, Payload
@@ -59,10 +59,10 @@ class Pipe:
         while True:
             # What is unpacked goes on as long as the bytes read before have more in them.
             data, ended = b"", False
-            if not self._text.more:
+            if not self._text.has_more:
                 data = await self._wait_for_bytes()
                 ended = not data
-            lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.more)
+            lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.has_more)
             payloads: list[Payload] = list(lines) if self._reader is None else self._reader.read(lines)
             if ended:
                 payloads += [] if self._reader is None else self._reader.end()

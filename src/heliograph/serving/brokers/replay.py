@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.recording import Recording, read_recording_rows
-from heliograph.files.table import columns_of
+from heliograph.files.table import convert_to_columns
 from heliograph.live.event import INPUTS, Event
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar
@@ -194,7 +194,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
         ValueError: no column `delay`, or a negative one.
     """
     events, trace = items("events", events, "events"), file_path("trace", trace)
-    columns = columns_of(str(trace), str(trace))
+    columns = convert_to_columns(str(trace), str(trace))
     if DELAY not in columns:
         raise fail(f"trace {trace}", f"a column {DELAY!r}, nan where a message was lost", list(columns))
     delays = np.asarray(columns[DELAY], dtype=float)

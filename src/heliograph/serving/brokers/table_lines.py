@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from heliograph.files.csv_columns import CsvColumnReader
-from heliograph.files.messages.in_files import PAYLOAD, TOPIC, convert_row, typed_cells
-from heliograph.files.messages.own_form import NODE, OWN, SEQUENCE, OwnReader
+from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
+from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnMessageReader
 from heliograph.files.recording import RowReader
-from heliograph.files.sources.reading import Reading, Unread
-from heliograph.files.table_rows import RowsAsColumns, join_cells
+from heliograph.files.recording_rows import RecordingRows, join_recording_rows
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.text.csv_dialects import COMMENTS, guess_names_in_header
 from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
-from heliograph.files.text.dialects import COMMENTS, names_in
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.replay import check_time_steps, encode_event, events_of_recording, row_events
@@ -45,7 +45,7 @@ class TableLineReader:
     def names_columns(self, line: str) -> bool:
         """Return whether a line is the first of a table: it names a column that the network or its sources know."""
         text = line.strip()
-        if not text or text[0] in "[{" or not (names := names_in(text)):
+        if not text or text[0] in "[{" or not (names := guess_names_in_header(text)):
             return False
         if text.startswith(ANNOTATIONS):
             return True
@@ -78,13 +78,15 @@ class TableLineReader:
     def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
         """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
         if {NODE, SEQUENCE} <= set(header):
-            own = OwnReader(self._network, self._source, self._ignore, table=True)
-            return MessageRowReader(lambda row: read_own_event(own, row.where, typed_cells(row)))
+            own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
+            return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
-                return MessageRowReader(lambda row: translator.decode(convert_row(row.where, typed_cells(row)), topic))
+                return MessageRowReader(
+                    lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
+                )
         return TimeRowReader(self._network, header, self._text, self._ignore)
 
 
@@ -117,7 +119,7 @@ class TimeRowReader:
         self._origin: np.datetime64 | None = None  # date of the first row, from which times are counted
         self._before: float | None = None  # time of the row before
         self._is_file = text.path is not None
-        self._cells = list[RowsAsColumns]()  # those of a file, until it ends
+        self._cells = list[RecordingRows]()  # those of a file, until it ends
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
         """Return the messages of rows, as a replay of them has them, and why others cannot be read.
@@ -139,7 +141,7 @@ class TimeRowReader:
         self._before = float(time[-1])
         return [*lines, *refused]
 
-    def _check_time_steps(self, cells: RowsAsColumns, time: np.ndarray) -> None:
+    def _check_time_steps(self, cells: RecordingRows, time: np.ndarray) -> None:
         """Raise ValueError where a row's time step is not the time since the row before; `time`: times of the rows.
 
         With the time of the row before them, the first step can be checked too. The check takes no step and no number
@@ -160,7 +162,7 @@ class TimeRowReader:
             return []
         with warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", UserWarning)
-            recording, self._cells = self._rows.arrange(join_cells(self._cells)), []
+            recording, self._cells = self._rows.arrange_recording(join_recording_rows(self._cells)), []
         for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
             LOG.warning("%s", line)
         events, origin = events_of_recording(recording, self._network)
@@ -177,7 +179,7 @@ class TimeRowReader:
         return np.asarray((time - self._origin) / SECOND)
 
 
-def read_own_event(reader: OwnReader, where: str, content: dict[str, object]) -> list[Payload]:
+def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in our own form, or why it cannot be read, with its count and time if known."""
     try:
         found = reader.read(where, content)
@@ -192,7 +194,7 @@ def read_own_event(reader: OwnReader, where: str, content: dict[str, object]) ->
     return payloads
 
 
-def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
+def _make_message(reader: OwnMessageReader, reading: Reading, arrival: float) -> Message:
     """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
     time = reading.time if reader.numbers else date_of(int(reading.time))

@@ -5,9 +5,9 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from heliograph.files.messages.in_files import FileMessage, message_name
-from heliograph.files.sources.fields import decode_json, parse_arrival
-from heliograph.files.sources.reading import Reading, Unread
+from heliograph.files.messages.message_files import FileMessage, make_default_topic
+from heliograph.files.sources.message_fields import decode_json, parse_arrival
+from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value
@@ -74,7 +74,7 @@ class Translator:
         Args:
             path: the file; None of a pipe.
         """
-        names = () if path is None else (path.name, message_name(path))
+        names = () if path is None else (path.name, make_default_topic(path))
         return next((name for name in names if name in self.sources.topics), self._alone)
 
     def topic_of_rows(self, path: Path | None, header: Sequence[str]) -> str | None:
@@ -85,7 +85,7 @@ class Translator:
             header: the names of the columns.
         """
         topic = self.topic_of(path)
-        if topic is None or (path is not None and topic in (path.name, message_name(path))):
+        if topic is None or (path is not None and topic in (path.name, make_default_topic(path))):
             return topic
         fields = [field for mapped in self.sources.of(topic) for field in mapped.source.fields]
         return topic if all(field in header or field.split(".")[0] in header for field in fields) else None
@@ -142,7 +142,7 @@ class Translator:
         results: list[Message | UnreadMessage | str] = []
         try:
             # A message that only says that a sender is online or offline has no readings: the sources note it.
-            if self.sources.take_word(topic, payload, where):
+            if self.sources.take_device_word(topic, payload, where):
                 return []
             # Messages of unknown topics are counted, whatever they carry.
             if not self.sources.of(topic):
@@ -165,7 +165,7 @@ class Translator:
         """Note the fields of a message, by which several senders of one node can be told; warn of them now and then."""
         senders = self.sources.senders
         senders.note_fields(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
-        for line in senders.lines_now_and_then():
+        for line in senders.describe_at_powers_of_two_messages():
             LOG.warning("%s", line)
 
     def _explain_unread(
@@ -196,7 +196,7 @@ class Translator:
             raise fail(f"{topic}, plant", expected, show_value(reading.plant))
         arrival = datetime.now(UTC) if known is None else known
         nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
-        reading = self.sources.date_as_original(reading, nanoseconds)
+        reading = self.sources.date_copy_as_original(reading, nanoseconds)
         time = self._date_reading(topic, reading, arrival, is_known=known is not None)
         # A message from a log says when it arrived. One that comes now says so only if its time is later than now: it
         # cannot have been measured after it came.

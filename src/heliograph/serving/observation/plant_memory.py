@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from prometheus_client import CollectorRegistry, Histogram
 
-from heliograph.report.outputs import RecentOutputs
+from heliograph.report.sensor_output_health import RecentInnovations
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis
 from heliograph.serving.observed_service import BatchTimes
 
@@ -47,7 +47,7 @@ class PlantMemory:
         """Begin with no plant; `names`: those of the received numbers by node and filter."""
         self.count, self._names = 0, names  # names of the received numbers by node and filter
         self.points: OrderedDict[str, deque[EstimatePoint]] = OrderedDict()
-        self.outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
+        self.outputs: OrderedDict[str, RecentInnovations] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self.crossings: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
         self.senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
@@ -62,9 +62,9 @@ class PlantMemory:
         """Return a plant's running tests by node and filter, made if needed, as the newest."""
         return _move_to_newest(self.tests, plant, dict, TESTED)
 
-    def outputs_of(self, plant: str) -> RecentOutputs:
+    def outputs_of(self, plant: str) -> RecentInnovations:
         """Return a plant's newest weighed outputs, made if needed, as the newest."""
-        return _move_to_newest(self.outputs, plant, lambda: RecentOutputs(MEMORY, self._names))
+        return _move_to_newest(self.outputs, plant, lambda: RecentInnovations(MEMORY, self._names))
 
     def keep_point(self, plant: str, message: Mapping[str, Any]) -> None:
         """Keep a plant's newest estimates as a point of its chart, and what its senders' silence means."""

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 from prometheus_client import CollectorRegistry
 from pydantic_core import from_json
 
-from heliograph.disk.quoting import join_names
+from heliograph.disk.quoted_text import join_names
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.checks.refusal_reasons import OF_NODES, WORDS
 from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
-from heliograph.report.outputs import RecentOutputs, make_output_row
+from heliograph.report.sensor_output_health import RecentInnovations, make_output_row
 from heliograph.serving.count_totals import FIELDS, CountTotals, counts_of
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.overview import PlantTroubles, TroubleOverview
@@ -90,7 +90,7 @@ class Watch:
         # Of all plants together: services, tests of claims, weighed outputs, counts, what is wrong, batches.
         self.services: list[WatchableService] = []
         self.nis: dict[tuple[str, str], RunningNis] = {}
-        self.outputs = RecentOutputs(MEMORY, names or {})
+        self.outputs = RecentInnovations(MEMORY, names or {})
         self.totals, self._overview = CountTotals(), TroubleOverview()
         no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
         self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)

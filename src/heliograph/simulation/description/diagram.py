@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import NamedTuple
 
-from heliograph.disk.quoting import join_names, visible
+from heliograph.disk.quoted_text import join_names, visible
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from heliograph.disk.quoting import join_names
+from heliograph.disk.quoted_text import join_names
 from heliograph.engine.choice import explain_refusal
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.sensor import without_output_names

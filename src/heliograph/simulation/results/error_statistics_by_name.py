@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import units_in

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 import heliograph
-from heliograph.disk.quoting import visible
+from heliograph.disk.quoted_text import visible
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, table
 from heliograph.numerics.types import ArrayLike

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heliograph.disk.palette import COLOURS
-from heliograph.disk.quoting import label_with_unit, quote_for_figure
+from heliograph.disk.colours_of_figures import COLOURS
+from heliograph.disk.quoted_text import label_with_unit, quote_for_figure
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike

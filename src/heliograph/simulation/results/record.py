@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.disk.quoting import label_with_unit
+from heliograph.disk.quoted_text import label_with_unit
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.model.estimate import Estimate, mask_sound_estimates
 from heliograph.model.forecast_origin import KeptOrigin, Origin

@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from heliograph.disk.palette import COLOURS
-from heliograph.disk.quoting import label_with_unit, visible
+from heliograph.disk.colours_of_figures import COLOURS
+from heliograph.disk.quoted_text import label_with_unit, visible
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.times.dates import format_times
 

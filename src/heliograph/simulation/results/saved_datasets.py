@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from heliograph.disk.quoting import quote_for_file, unquote_file
-from heliograph.disk.whole_file import check_replaceable, check_writable, whole_file, whole_folder
+from heliograph.disk.atomic_files import check_replaceable, check_writable, whole_file, whole_folder
+from heliograph.disk.quoted_text import quote_for_file, unquote_file
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.results.labelled_datasets import select_given_units
 

@@ -1,0 +1,94 @@
+"""The application that holds the commands, the types of their options, and completion in a shell."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter, Token
+
+import heliograph
+
+if TYPE_CHECKING:
+    from heliograph.files.stores.store_address import StoreAddress
+
+app = App(
+    name="heliograph",
+    help="State estimation over relay networks.",
+    version=heliograph.__version__,
+    help_format="plaintext",
+)
+
+
+def integer_option(text: str) -> Parameter:
+    """Declare an option that is an integer."""
+    return Parameter(help=text, converter=_convert_to_int)
+
+
+def path_option(text: str = "") -> Parameter:
+    """Declare an option that is a file or folder."""
+    return Parameter(help=text, converter=_convert_to_path)
+
+
+MEASURED = (
+    "CSV or Parquet: rows or events; messages in lines of JSON; a folder of these; a bag; influx:// or "
+    "postgresql://...?query=."
+)
+
+
+def measured_option(text: str = MEASURED) -> Parameter:
+    """Declare an option that is measured data: a file, or the URL of a store."""
+    return Parameter(help=text, converter=_convert_to_path_or_store, accepts_keys=False, n_tokens=1)
+
+
+def estimates_option() -> Parameter:
+    """Declare an option that is where estimates go: a file, or the URL of a store."""
+    return Parameter(
+        help="CSV, Parquet or MCAP to write, or influx:// or postgresql://...?table=: estimates with their claims.",
+        converter=_convert_to_path_or_store,
+        accepts_keys=False,
+        n_tokens=1,
+    )
+
+
+def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
+    """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` is that one.
+
+    Raises:
+        ValueError: no `--out`, or a folder that cannot be written.
+    """
+    from heliograph.disk.atomic_files import check_folder_writable
+    from heliograph.numerics.check import fail
+
+    if out is None:
+        raise fail(command, "a folder for the results (--out DIR)", "none")
+    check_folder_writable(out)
+    return out.parent if out.name == name else out
+
+
+def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
+    """Convert digits to an integer; fractions are refused."""
+    if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
+        raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
+    return int(tokens[0].value)
+
+
+def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
+    """Convert a text to a path; an empty one is refused."""
+    if not tokens[0].value or "\0" in tokens[0].value:
+        raise ValueError(f"expected a path, got {tokens[0].value!r}")
+    return Path(tokens[0].value)
+
+
+def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
+    """Convert the URL of a store to its address, any other text to a path."""
+    from heliograph.files.stores.store_address import is_store, parse_store
+
+    return parse_store(tokens[0].value) if is_store(tokens[0].value) else _convert_to_path(kind, tokens)
+
+
+def completion(
+    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(help="Which shell.")], /
+) -> None:
+    """Print a shell's completion script; in bash: eval "$(heliograph completion bash)"."""
+    print(app.generate_completion(prog_name="heliograph", shell=shell))

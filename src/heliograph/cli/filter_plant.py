@@ -1,0 +1,273 @@
+"""One plant of `heliograph run`: its rows filtered and forecast, and its estimates written."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote
+
+import heliograph
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions
+from heliograph.files.stores.store_address import StoreAddress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    import numpy as np
+
+    from heliograph.files.estimates.forecasts_table import ByFilter
+    from heliograph.files.recording import Recording
+    from heliograph.model.estimate import Estimate
+    from heliograph.simulation.network import Network
+    from heliograph.simulation.results.record import Record
+    from heliograph.smoothing import FixedInterval, FixedLag
+
+    Write = Callable[[Record, Path | StoreAddress], None]
+    Horizons = int | list[float | np.timedelta64 | np.datetime64]
+
+
+LEAST_CAPACITY = 1000  # of a replay, in rows
+
+
+class FilteredPlant(NamedTuple):
+    """What was measured of a plant, and what its filters made of it.
+
+    Args:
+        data: what was measured.
+        record: all rows, filtered.
+        written: those rows of the record in which something was measured: their estimates are written.
+        forecasts: of rows after the last, by node and filter; {} where not asked for.
+        predicted: of each row from those before it, likewise.
+        doubted: lines on what filters doubt and what could not be read.
+        said: lines for the summary.
+    """
+
+    data: MeasuredPlant
+    record: "Record"
+    written: "Record"
+    forecasts: "ByFilter"
+    predicted: "ByFilter"
+    doubted: list[str]
+    said: list[str]
+
+
+def filter_plant(
+    network: "Network",
+    data: MeasuredPlant,
+    smooth: "FixedInterval | FixedLag | None",
+    horizons: "Horizons | None",
+    predicts: bool,
+) -> FilteredPlant:
+    """Filter a plant's rows, and smooth them, forecast behind them and predict each of them where that is asked for.
+
+    `horizons`: how far ahead to forecast; None for no forecasts.
+    """
+    record, doubts = filter_rows(network, data.recording, smooth)
+    # Times of dated messages count from a date, in seconds.
+    if data.events is not None and data.events.dated and record.origin is not None:
+        record = record.with_units({"time": "s"} | record.units)
+    said = [*_describe_doubted_values(network, record), *data.summary]
+    forecasts: ByFilter = {}
+    if horizons is not None:
+        forecasts = _make_forecasts(record, horizons)
+        said.append(_describe_forecasts(forecasts))
+    return FilteredPlant(
+        data=data,
+        record=record,
+        written=_select_rows_of_record(record, data.rows),
+        forecasts=forecasts,
+        predicted=heliograph.forecasting.predict_record(record, data.recording.inputs) if predicts else {},
+        doubted=[*data.warnings, *record.failures(), *doubts],
+        said=said,
+    )
+
+
+def write_plant_estimates(
+    plant: FilteredPlant,
+    place: Path | StoreAddress,
+    network: "Network",
+    module: "Mapping[str, object]",
+    lag: float | None,
+    options: ReadingOptions,
+) -> list[str]:
+    """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
+    write = _make_estimates_writer(plant.data, module)
+    predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
+    _write_estimates(write, plant.written, plant.forecasts, predicted, place, plant.data)
+    return _write_lagged_estimates(network, plant.data, lag, options, place, write)
+
+
+def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
+    """Return where a plant's estimates go: of several, each has a file of its name."""
+    if isinstance(out, StoreAddress):
+        return out
+    return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
+
+
+def filter_rows(
+    network: "Network",
+    recording: "Recording",
+    smooth: "FixedInterval | FixedLag | None" = None,
+    after: "Record | None" = None,
+) -> tuple["Record", list[str]]:
+    """Return the record of the filtered rows, and the warnings that were given meanwhile as lines.
+
+    `after`: the record of the rows before these.
+    """
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", UserWarning)
+        record = heliograph.run(network, *recording, smooth=smooth, after=after)
+    return record, [str(doubt.message) for doubt in doubts]
+
+
+def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
+    """Return a line for each output on how many of its values the filters that weigh them doubted, and their bias."""
+    from heliograph.report.sensor_output_health import summarise_weighed_outputs
+
+    return [str(output) for output in summarise_weighed_outputs(network, record)]
+
+
+def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Record":
+    """Return some of the rows of a record, and of its smoothed estimates, which are of its last rows.
+
+    `rows`: a mask, (rows,); None for all. What is said of all rows together, as of weighing and uplinks, is left out.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    if rows is None or rows.all():
+        return record
+
+    def select(estimate: "Estimate") -> "Estimate":
+        """Return these rows of an estimate."""
+        return replace(
+            estimate,
+            mean=np.asarray(estimate.mean)[rows],
+            covariance=np.asarray(estimate.covariance)[rows],
+            modes=None if estimate.modes is None else np.asarray(estimate.modes)[rows],
+        )
+
+    smoothed = record.smoothed
+    return replace(
+        record,
+        time=record.time[rows],
+        truth=None if record.truth is None else np.asarray(record.truth)[rows],
+        measurements={node: z[rows] for node, z in record.measurements.items()},
+        estimates={
+            node: {name: select(estimate) for name, estimate in filters.items()}
+            for node, filters in record.estimates.items()
+        },
+        smoothed=None if smoothed is None else _select_rows_of_record(smoothed, rows[-len(smoothed.time) :]),
+        reports={},
+        uplinks={},
+        weighed={},
+    )
+
+
+def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
+    """Return a forecast of each estimate from the last row."""
+    forecasts = heliograph.forecast(record, ahead, inputs="held")
+    assert isinstance(forecasts, dict)  # of a network
+    return forecasts
+
+
+def _describe_forecasts(forecasts: "ByFilter") -> str:
+    """Return a line on how far forecasts go, and with which inputs."""
+    from heliograph.numerics.times.dates import format_times
+
+    any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
+    held = "" if any_forecast.inputs == "none" else ", inputs held at those of the last row"
+    (last,) = format_times(any_forecast.time[-1:])
+    return f"forecast: {len(any_forecast.steps)} rows beyond the data, to {last}{held}"
+
+
+def _select_times_of_predictions(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
+    """Return what was predicted of some of the rows; `rows`: a mask, None for all."""
+    if rows is None or rows.all():
+        return predicted
+    selected = {}
+    for node, filters in predicted.items():
+        selected[node] = {name: forecast.select(rows) for name, forecast in filters.items()}
+    return selected
+
+
+def _write_estimates(
+    write: "Write",
+    record: "Record",
+    forecasts: "ByFilter",
+    predicted: "ByFilter",
+    place: Path | StoreAddress,
+    data: "MeasuredPlant",
+) -> None:
+    """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
+    if not forecasts and not predicted:
+        write(record, place)
+        return
+    from heliograph.files.estimates.estimates_table import estimate_columns
+    from heliograph.files.estimates.forecasts_table import make_forecast_columns
+    from heliograph.files.stores.store_tables import write_columns_to_store
+    from heliograph.files.table import write_table
+
+    columns = make_forecast_columns(record, forecasts, predicted) if forecasts else estimate_columns(record, predicted)
+    if isinstance(place, Path):
+        write_table(columns, place)
+    else:
+        write_columns_to_store(place, columns, data.plant, _find_date_of_time_zero(data))
+
+
+def _write_lagged_estimates(
+    network: "Network",
+    data: "MeasuredPlant",
+    lag: float | None,
+    options: ReadingOptions,
+    place: Path | StoreAddress,
+    write: "Write",
+) -> list[str]:
+    """Write the estimates of each row given all that came up to a lag after it, in a file or table of their own.
+
+    Return a line on it; none without a lag, and of rows of time.
+    """
+    if lag is None or data.events is None:
+        return []
+    from heliograph.live.recorded import replay_events
+    from heliograph.model.plant import TIME_STEP
+
+    window, ahead = options.limits
+    start = float(data.recording.time[0]) if TIME_STEP in network.inputs else 0.0  # the initial law is of that moment
+    capacity = max(LEAST_CAPACITY, len(data.events))  # with less room than rows the oldest become final early
+    lagged = replay_events(network, data.events.sort_events(), window, lag, start, ahead, capacity).lagged
+    if lagged is None:
+        return []
+    beside: Path | StoreAddress
+    if isinstance(place, Path):
+        beside = place.with_suffix(f".lagged{place.suffix}")
+    else:
+        beside = place.with_table(f"{place.table_for_estimates}_lagged")
+    write(lagged, beside)
+    return [f"{beside}: {len(lagged.time)} rows, each given what came {lag:g} later"]
+
+
+def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
+    """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
+    from heliograph.files.bags.estimates_writer import write_bag
+    from heliograph.files.estimates.estimates_table import estimate_columns, write_estimates
+    from heliograph.files.stores.store_tables import write_columns_to_store
+
+    origin = _find_date_of_time_zero(data)
+
+    def write(record: "Record", path: Path | StoreAddress) -> None:
+        """Write the estimates of a record, in the form that the path asks for."""
+        if isinstance(path, StoreAddress):
+            write_columns_to_store(path, estimate_columns(record), data.plant, origin)
+        elif path.suffix.lower() == ".mcap":
+            write_bag(record, path, origin, module.get("pose"))  # type: ignore[arg-type]  # it says what it expects
+        else:
+            write_estimates(record, path)
+
+    return write
+
+
+def _find_date_of_time_zero(data: "MeasuredPlant") -> "np.datetime64 | None":
+    """Return the date of time 0, of messages whose times are dates."""
+    messages = data.events
+    return None if messages is None or messages.steps or messages.numbers else messages.date

@@ -1,0 +1,122 @@
+"""Signals that end a command: the running code unwinds, so that no partial files are left."""
+
+import signal
+import sys
+from _thread import interrupt_main
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Timer
+from types import FrameType, TracebackType
+from typing import NoReturn, TypeVar
+
+from heliograph.numerics.process.stop_signals import STOPPING, handle_stop_signals
+
+SIGNALLED = 128  # plus the signal's number: the exit code of what a signal ended
+INTERRUPTED, TERMINATED = SIGNALLED + signal.SIGINT, SIGNALLED + signal.SIGTERM
+
+T = TypeVar("T")
+SOON = 0.01  # seconds
+
+
+@contextmanager
+def unwind_on_signals(stopped: list[int]) -> Iterator[None]:
+    """Let SIGINT and SIGTERM unwind the running code, so that no temporary file is left; record each in `stopped`.
+
+    An exception that is raised in a callback of the compiler, or in a destructor, does not get out of it: Python only
+    reports it. An interrupt that ends so is raised again by a timer.
+    """
+
+    def interrupt(number: int, _: FrameType | None) -> NoReturn:
+        """Record a signal, and raise what `except Exception` does not catch."""
+        stopped.append(number)
+        raise KeyboardInterrupt
+
+    def interrupt_later(what: "sys.UnraisableHookArgs") -> None:
+        """Raise an interrupt that was swallowed once more, a little later; report all else as before."""
+        if issubclass(what.exc_type, KeyboardInterrupt):
+            timer = Timer(SOON, interrupt_main)  # raised at once, it would be swallowed again
+            timer.daemon = True
+            timers.append(timer)
+            timer.start()
+        else:
+            report_before(what)
+
+    timers: list[Timer] = []
+    report_before, sys.unraisablehook = sys.unraisablehook, interrupt_later
+    try:
+        with handle_stop_signals(interrupt):
+            yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = report_before
+
+
+class GentleStop:
+    """A stop that keeps what there is: after `note_next_signal_only` the first signal is noted, the second unwinds.
+
+    The exit code is that of the first: a second may be the interrupt that `unwind_on_signals` raises again where the
+    first was swallowed. As a context it gives the signals back at its end.
+    """
+
+    def __init__(self) -> None:
+        self._number = 0  # of the first signal; 0 for none
+        self._handlers: dict[int, object] = {}  # of each signal before `note_next_signal_only`, to be put back
+
+    def __enter__(self) -> "GentleStop":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._restore_handlers()
+
+    @property
+    def requested(self) -> bool:
+        """Return whether a signal came."""
+        return bool(self._number)
+
+    @property
+    def code(self) -> int:
+        """Return the command's exit code: 0, or the one that says which signal stopped it."""
+        return SIGNALLED + self._number if self._number else 0
+
+    def note_next_signal_only(self) -> None:
+        """Only note the next signal."""
+        if not self._handlers and not self._number:
+            self._handlers = {number: signal.getsignal(number) for number in STOPPING}
+            for number, handler in self._handlers.items():
+                if handler is not signal.SIG_IGN:
+                    signal.signal(number, self._note_signal)
+
+    def raise_if_requested(self) -> None:
+        """Raise KeyboardInterrupt if a signal came."""
+        if self._number:
+            raise KeyboardInterrupt
+
+    def run_unless_stopped(self, work: Callable[[], T]) -> T | None:
+        """Return the value of work that may be left out, None if a signal came before its end."""
+        if self._number:
+            return None
+        try:
+            with handle_stop_signals(self._raise_on_signal):
+                return work()
+        except KeyboardInterrupt:
+            if not self._number:
+                raise
+        self._restore_handlers()
+        return None
+
+    def _raise_on_signal(self, number: int, _: FrameType | None) -> NoReturn:
+        """Note a signal, and end what is running."""
+        self._number = self._number or number
+        raise KeyboardInterrupt
+
+    def _note_signal(self, number: int, _: FrameType | None) -> None:
+        """Note a signal; the next one has its effect of before."""
+        self._number = self._number or number
+        self._restore_handlers()
+
+    def _restore_handlers(self) -> None:
+        """Give signals the handlers back that they had before `note_next_signal_only`."""
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._handlers = {}

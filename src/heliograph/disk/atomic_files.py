@@ -1,0 +1,300 @@
+"""Files and folders that appear whole or not at all, also after a power failure, and locks on them."""
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from glob import escape as glob_escape
+from pathlib import Path
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.process.stop_signals import hold_signals
+
+try:
+    import fcntl
+except ImportError:  # no such system call: then nothing is held, and what others left is never cleared
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".lock"
+
+
+@contextmanager
+def try_lock(path: Path) -> Iterator[bool]:
+    """Try to lock the file or folder at `path`; yields whether the lock was obtained."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:  # its holder has just removed it
+        yield False
+        return
+    try:
+        yield _lock_handle(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[bool]:
+    """Lock a folder by a lock file in it; yields whether the lock was obtained.
+
+    The lock file is removed with the lock, and so are folders that were made for it and stayed empty. A killed process
+    leaves the file, which then locks nothing.
+    """
+    made = [missing for missing in (folder, *folder.parents) if not missing.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / LOCK
+    try:
+        handle = _open_locked(path)
+        if handle is None:
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            path.unlink(missing_ok=True)
+            os.close(handle)
+    finally:
+        for missing in made:
+            with suppress(OSError):  # something is in it
+                missing.rmdir()
+
+
+def _open_locked(path: Path) -> int | None:
+    """Return the handle of the lock file at `path`, made if needed and locked; None if somebody else holds the lock."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        if not _lock_handle(handle):
+            os.close(handle)
+            return None
+        # The path must still name the locked file: a holder before us may have removed the one that we opened.
+        if _is_path_of_handle(path, handle):
+            return handle
+        os.close(handle)
+
+
+def _is_path_of_handle(path: Path, handle: int) -> bool:
+    """Return whether a path is that of an open file."""
+    with suppress(FileNotFoundError):
+        other = os.open(path, os.O_RDONLY)
+        same = os.path.sameopenfile(handle, other)
+        os.close(other)
+        return same
+    return False
+
+
+def _lock_handle(handle: int) -> bool:
+    """Take the lock of an open file without waiting; return whether it was free (always, where locks do not exist)."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def sync(path: Path) -> None:
+    """Flush a file or folder to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def flush_tree_to_disk(folder: Path) -> None:
+    """Flush a folder with all its contents to the disk."""
+    for path in (*folder.rglob("*"), folder):
+        sync(path)
+
+
+def replace(partial: Path, path: Path) -> None:
+    """Move a complete file to `path`, atomically, over an existing file if there is one."""
+    sync(partial)
+    os.replace(partial, path)
+    sync(path.parent)
+
+
+@contextmanager
+def name_path_in_errors(path: Path | str) -> Iterator[None]:
+    """Within this context, add the path to errors of the system that lack one, such as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary file next to `path` that replaces it at the end; removed after an error or interrupt."""
+    with whole_files([path]) as (partial,):
+        yield partial
+
+
+@contextmanager
+def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
+    partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
+    for path in paths:
+        _remove_leftover_files(path)
+    replaced: list[tuple[Path, bytes | None]] = []  # with the earlier contents, None of a file that is new
+    try:
+        with name_path_in_errors(paths[0]):
+            yield partials
+        # Once the last is replaced nothing is undone, so that its earlier content need not be kept.
+        with hold_signals():
+            for partial, path in zip(partials, paths, strict=True):
+                before = path.read_bytes() if path != paths[-1] and path.exists() else None
+                with name_path_in_errors(path):
+                    replace(partial, path)
+                replaced.append((path, before))
+    except BaseException:
+        # Remove temporary files, and undo: files that are new go, others get their earlier contents.
+        with hold_signals():
+            for partial in partials:
+                partial.unlink(missing_ok=True)
+            are_all_replaced = len(replaced) == len(paths)
+            for path, before in () if are_all_replaced else replaced:
+                if before is None:
+                    path.unlink()
+                else:
+                    path.write_bytes(before)
+        raise
+
+
+def _remove_leftover_files(path: Path) -> None:
+    """Remove the temporary files next to `path` of processes that no longer run."""
+    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
+        if not _is_running(left.name.split(".")[-2]):
+            left.unlink(missing_ok=True)
+
+
+def _is_running(process: str) -> bool:
+    """Return whether a process of this number runs; True where that is unknown."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OSError):
+        return True
+    return True
+
+
+FORMATS = (".csv", ".parquet")
+
+
+def check_writable(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
+    """Raise the error that writing the file would raise, before the work starts.
+
+    Args:
+        path: file to be written.
+        formats: extensions that are allowed.
+    """
+    path = Path(path)
+    if format_of(path, formats) == ".parquet":
+        import pyarrow.parquet  # noqa: F401
+    if path.is_dir():
+        raise fail(f"output file {path}", "a file", "a folder")
+    if not path.parent.exists():
+        raise fail(f"output folder {path.parent}", "an existing folder", "nothing of that name")
+    check_folder_writable(path.parent)
+
+
+def check_folder_writable(folder: str | Path) -> None:
+    """Raise ValueError unless files can be written in the folder, or it can be made."""
+    folder = Path(folder)
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    name = f"output folder {folder}"
+    if not existing.is_dir():
+        raise fail(name, "a folder", "a file" if existing == folder else f"a file {existing} on its path")
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        raise fail(name, "a folder that can be written", error.strerror) from None
+
+
+def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
+    """Return the extension of a file name in lower case, which determines the format."""
+    kind = path.suffix.lower()
+    if kind not in formats:
+        raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
+    return kind
+
+
+def check_replaceable(target: Path, mark: str) -> None:
+    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results."""
+    check_folder_writable(target)
+    remove_leftover_folders(target)
+    if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():
+        raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to replace", "other files")
+
+
+@contextmanager
+def whole_folder(target: Path) -> Iterator[Path]:
+    """Yield an empty folder that replaces `target` at the end; after an error or interrupt `target` is unchanged.
+
+    Remains of killed processes that wrote the same folder are cleared first, and earlier results that one had moved
+    aside are restored.
+    """
+    remove_leftover_folders(target)
+    made = [folder for folder in target.parents if not folder.exists()]
+    temporary: Path | None = None  # a folder in the same file system; a lock on it says that we run
+    lock = ExitStack()
+    try:
+        with hold_signals():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+            (temporary / "new").mkdir()
+            lock.enter_context(try_lock(temporary))
+        # The lock goes before the folder is renamed.
+        with lock, name_path_in_errors(target):
+            yield temporary / "new"
+            flush_tree_to_disk(temporary / "new")
+        with hold_signals():
+            _replace_folder(temporary, target)
+    except BaseException:
+        with hold_signals():
+            lock.close()
+            if temporary is not None:
+                _restore_old_folder(temporary, target)
+            for folder in made:
+                with suppress(OSError):  # somebody else's files came into it meanwhile
+                    folder.rmdir()
+        raise
+
+
+def _restore_old_folder(temporary: Path, target: Path) -> None:
+    """Put earlier results that were moved aside back in place of `target`, and remove the temporary folder."""
+    if (temporary / "old").exists() and not target.exists():
+        (temporary / "old").rename(target)
+    shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _replace_folder(partial: Path, target: Path) -> None:
+    """Put the new folder of `partial` in place of `target` by two renames, and remove the old one."""
+    if target.exists():
+        target.rename(partial / "old")
+    (partial / "new").rename(target)
+    sync(target.parent)
+    shutil.rmtree(partial)
+
+
+def remove_leftover_folders(target: Path) -> None:
+    """Remove the temporary folders next to `target` that killed processes left, none that a running process uses.
+
+    A folder with something else in it is nobody's of ours. Earlier results that were moved aside are put back.
+    """
+    if not target.parent.is_dir():
+        return
+    for left in target.parent.glob(f".{glob_escape(target.name)}-*"):
+        if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
+            continue
+        with try_lock(left) as ours:
+            if not ours or {p.name for p in left.iterdir()} - {"new", "old"}:
+                continue
+            if (left / "old").exists() and not target.exists():
+                (left / "old").rename(target)
+            shutil.rmtree(left)

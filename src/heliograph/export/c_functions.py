@@ -1,0 +1,171 @@
+"""Text of the functions of an exported step: whole, or its prediction, its correction and a start apart."""
+
+from heliograph.export.step_parts import PartOfStep
+from heliograph.export.step_program import Real, StepProgram
+
+
+def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
+    """Return the heads of the functions that move the state: of the step, or also of its parts, the step last."""
+    state = f"{prefix}_state *state"
+    step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
+    if len(program.parts) == 1:
+        return [step]
+    start = f"int {prefix}_start_at({state}, const {real} mean[], const {real} covariance[])"
+    predict = f"int {prefix}_predict({state}, const {real} u[])"
+    correct = f"int {prefix}_correct({state}, const {real} z[], {prefix}_innovation *innovation)"
+    return [*([] if program.start_at is None else [start]), predict, correct, step]
+
+
+def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
+    """Return the declaration of what a correction tells beside the estimate; "" of a whole step."""
+    if len(program.parts) == 1:
+        return ""
+    count = max(program.filter.received, 1)
+    weight = f"    {real} weight[{count}];\n" if "weight" in program.parts[1].beside else ""
+    return (
+        f"typedef struct {{\n    {real} value[{count}];\n{weight}    {real} nis;\n    {real} arrived;\n"
+        f"}} {prefix}_innovation;\n\n"
+    )
+
+
+def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
+    """Return lines for the header on the functions that are apart."""
+    lines = [
+        "",
+        f"{prefix}_step is {prefix}_predict and {prefix}_correct, which may be called apart: predict at each step of",
+        "time, and then correct as often as measurements come, each with the components of z that are new and NaN for",
+        "all others. Noises of components that come in different calls are taken to be independent.",
+        f"{prefix}_correct tells in *innovation, unless that is a null pointer, z - E[z] (NaN: did not arrive), and",
+        "its squared size nis in units of its covariance (NaN: nothing arrived), chi-squared of so many degrees of",
+        "freedom as components arrived; also of a measurement that it refuses.",
+    ]
+    if "weight" in program.parts[1].beside:
+        lines.append("weight is how much of each component was used: 1 all, 0 left out.")
+    if program.start_at is not None:
+        lines += [
+            f"{prefix}_start_at starts from another mean and covariance, row by row, in place of {prefix}_start; it",
+            "returns 0, or refuses by 7 what is no finite mean or no covariance.",
+        ]
+    return lines
+
+
+def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[str]:
+    """Return the text of the functions of C that move the state, in the order of `list_signatures`.
+
+    That is `step` alone, or, of a program in two parts, `start_at` (if the state can be set), `predict`, `correct` and
+    `step`, which calls `predict` and `correct`. Each returns 0, or the number of a reason to refuse, and writes the
+    state only where nothing is refused.
+    """
+    heads = list_signatures(program, prefix, real)
+    if len(program.parts) == 1:
+        body = [
+            *_generate_measurement_check(program),
+            *_generate_inputs_check(program),
+            *_generate_part_statements(program, 0, prefix),
+            "    return 0;",
+        ]
+        return [_join_function(heads[0], body)]
+    predict = [*_generate_inputs_check(program), *_generate_part_statements(program, 0, prefix), "    return 0;"]
+    correct = [*_generate_measurement_check(program), *_generate_part_statements(program, 1, prefix), "    return 0;"]
+    step = [
+        f"    {prefix}_state after = *state;",
+        f"    int refused = {prefix}_predict(&after, u);",
+        "    if (refused != 0) { return refused; }",
+        f"    refused = {prefix}_correct(&after, z, NULL);",
+        "    if (refused != 0) { return refused; }",
+        "    *state = after;",
+        "    return 0;",
+    ]
+    start = [] if program.start_at is None else [_generate_start_statements(program, prefix)]
+    return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
+
+
+def _join_function(head: str, body: list[str]) -> str:
+    """Return the text of a function from its head and the lines of its body."""
+    return "\n".join([head, "{", *body, "}"])
+
+
+def _generate_measurement_check(program: StepProgram) -> list[str]:
+    """Return the statements that refuse infinite components of a measurement."""
+    return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
+
+
+def _generate_inputs_check(program: StepProgram) -> list[str]:
+    """Return the statements that refuse inputs that are not finite, and a step past the end."""
+    lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
+    if program.filter.horizon is not None:
+        lines.append(f"    if (state->step >= {program.filter.horizon}) {{ return 3; }}")
+    return lines
+
+
+def _generate_part_statements(program: StepProgram, number: int, prefix: str) -> list[str]:
+    """Return the statements of C that compute a part, refuse what is wrong, and then write all that changed.
+
+    `number` is that of the part: of the whole step or the prediction 0, of the correction 1. All is computed into
+    `after`, a copy of the state. A refusal returns its code: 4 the estimate would not be finite, 5 it would lose its
+    digits, 6 the inputs are none.
+    """
+    part, code = program.parts[number], program.computes[number]
+    is_correction = part.name == "correct"
+    flags = [name for name in part.beside if name in ("implausible", "spoilt")]
+    declarations = [
+        f"    {prefix}_state after;",
+        *([f"    {prefix}_innovation news;"] if is_correction else []),
+        *(f"    unsigned char {name}[1];" for name in flags),
+    ]
+    # The call: a number without axes is passed by value (as [0] of its member), all else as an array.
+    read = [f"state->{m.name}" + ("" if m.start.ndim else "[0]") for m in program.read]
+    written = [*(f"after.{m.name}" for m in program.members), *(_name_place_of_result(name) for name in part.beside)]
+    arguments = [*read, *part.data, _generate_step_number_expression(program, part), *written]
+    call = f"    {code.name}(\n        " + ",\n        ".join(arguments) + ");"
+    checks = [
+        *(["    if (spoilt[0] != 0U) { return 6; }"] if "spoilt" in flags else []),
+        f"    for (int i = 0; i < {len(program.filter.states)}; ++i) {{",
+        f"        if (!isfinite(after.{program.mean}[i])) {{ return 4; }}",
+        "    }",
+        "    if (implausible[0] != 0U) { return 5; }",
+    ]
+    # A prediction or a whole step begins the next step; a correction belongs to the step that was predicted.
+    step = "state->step" if is_correction else "state->step + 1"
+    return [
+        *declarations,
+        call,
+        *(["    if (innovation != NULL) { *innovation = news; }"] if is_correction else []),
+        *checks,
+        *([f"    after.step = {step};"] if program.counts else []),
+        "    *state = after;",
+    ]
+
+
+def _name_place_of_result(name: str) -> str:
+    """Return the C expression for where a result beside the state is written: flags are local, others in `news`.
+
+    That is the innovation that the function tells; of it single numbers are passed by their address.
+    """
+    if name in ("implausible", "spoilt"):
+        return name
+    return f"&news.{name}" if name in ("nis", "arrived") else f"news.{name}"
+
+
+def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> str:
+    """Return the C expression for the number of the step that a part belongs to.
+
+    A prediction counts the step: a correction's is one less than the state's count.
+    """
+    if not program.counts:
+        return "0"
+    return "state->step > 0 ? state->step - 1 : 0" if part.name == "correct" else "state->step"
+
+
+def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
+    """Return the statements of a start from a given mean and covariance."""
+    members = ", ".join(f"after.{m.name}" for m in program.members)
+    return [
+        f"    {prefix}_state after;",
+        "    unsigned char none[1];",
+        f"    {program.start_at.name}(mean, covariance, {members}, none);",
+        "    if (none[0] != 0U) { return 7; }",
+        *(["    after.step = 0;"] if program.counts else []),
+        "    *state = after;",
+        "    return 0;",
+    ]

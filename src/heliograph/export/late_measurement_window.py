@@ -1,0 +1,338 @@
+"""Text of the functions of an exported filter that takes late measurements: rows held, and run again from a late one.
+
+Held is of each row the state before it, its measurement and its inputs. A measurement of the past is filled into its
+row; where the plant's input is a time step, a row is made for it, and that of the row after it becomes the rest. What
+was held is run again from there, as in order. Where a row is refused, what was filled in is taken out and the rows
+are run again as before, so that all is as it was, to the last bit.
+"""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.struct_layout import StructLayout, lay_out_array, lay_out_struct
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.checks.split_intervals import explain_uneven_prediction, find_indivisible_part
+from heliograph.model.over_time import first
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import check_count, fail
+
+DIGITS = {"double": float(np.finfo(np.float64).eps), "float": float(np.finfo(np.float32).eps)}
+
+
+class LateMeasurementWindow(NamedTuple):
+    """Rows that are held for late measurements.
+
+    Args:
+        steps: how many rows before the newest one a measurement may be late.
+        time: place of the time step among the inputs; None where time counts steps.
+        received: numbers of a measurement.
+        inputs: numbers of an input.
+    """
+
+    steps: int
+    time: int | None
+    received: int
+    inputs: int
+
+    @property
+    def rows(self) -> int:
+        """Return how many rows are held."""
+        return self.steps + 1
+
+    @property
+    def places(self) -> int:
+        """Return places for rows: one more where a row may be made, before the oldest is dropped."""
+        return self.rows + (self.time is not None)
+
+
+def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
+    """Return how many steps late a measurement may be, checked: a filter in continuous time can make rows in between.
+
+    Warns where a plant's prediction over an interval is not that over its parts.
+
+    Raises:
+        ValueError: no positive whole number; continuous time where a part goes by steps.
+    """
+    count = check_count("window", steps)
+    if TIME_STEP not in filter.inputs:
+        return count
+    expected = f"no part that goes by steps where the plant's time does not (its input {TIME_STEP!r})"
+    if filter.horizon is not None:
+        raise fail("window", expected, f"one that covers {filter.horizon} steps")
+    premise = filter.premise
+    if premise is not None:
+        if what := find_indivisible_part(premise.plant, premise.sensor, premise.channel, premise.trigger):
+            raise fail("window", expected, what)
+        if what := explain_uneven_prediction(first(premise.plant), filter.inputs.index(TIME_STEP)):
+            warnings.warn(f"window: predictions depend on what comes late: {what}", stacklevel=4)
+    return count
+
+
+class WindowText(NamedTuple):
+    """What a window adds to the files: lines of the comment, types, heads and functions; and its bytes."""
+
+    comment: list[str]
+    types: str
+    heads: list[str]
+    functions: list[str]
+    size: int
+
+
+def generate_window_code(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
+    """Return the text of the window of a filter whose plant counts steps, or has a time step among its inputs.
+
+    Args:
+        program: the step.
+        steps: how many rows before the newest one a measurement may be late.
+        state: layout of the filter's state.
+        prefix: of all names.
+        real: type of numbers.
+    """
+    filter = program.filter
+    inputs, received = filter.inputs, filter.received
+    place_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
+    window = LateMeasurementWindow(steps=steps, time=place_of_time, received=received, inputs=len(inputs))
+    # The struct: the present state, rows of a state with the measurement and the inputs after it, and the four counters
+    # of `_declare_window`. C has no arrays of length 0.
+    data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
+    row = lay_out_struct([state, *data])
+    counters = [lay_out_array("uint32_t", 1)] * 4
+    whole = lay_out_struct([state, StructLayout(window.places * row.size, row.alignment), *counters])
+    return WindowText(
+        comment=_explain_window(window, prefix, whole.size),
+        types=_declare_window(window, prefix, real),
+        heads=_list_function_heads(window, prefix, real),
+        functions=_generate_window_functions(window, prefix, real),
+        size=whole.size,
+    )
+
+
+def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
+    """Return the heads of the window's functions."""
+    held, ago = f"{prefix}_window *window", "uint32_t steps" if window.time is None else f"{real} age"
+    return [
+        f"void {prefix}_window_start({held})",
+        f"int {prefix}_window_step({held}, const {real} z[], const {real} u[])",
+        f"int {prefix}_window_late({held}, {ago}, const {real} z[])",
+    ]
+
+
+def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> str:
+    """Return the declarations of a row and of the window."""
+    received, inputs = max(window.received, 1), max(window.inputs, 1)
+    return f"""typedef struct {{
+    {prefix}_state before;
+    {real} z[{received}];
+    {real} u[{inputs}];
+}} {prefix}_row;
+
+typedef struct {{
+    {prefix}_state now;
+    {prefix}_row rows[{window.places}];
+    uint32_t first;
+    uint32_t count;
+    uint32_t late;
+    uint32_t held;
+}} {prefix}_window;
+
+"""
+
+
+def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int) -> list[str]:
+    """Return lines for the header on the window: what a late measurement is, what it costs, what is refused.
+
+    A row is a step that the window holds. A late measurement has all rows from its own on run again, at most all
+    `places`; where that is refused they are run once more without it, hence twice the time.
+
+    Args:
+        window: how many steps it holds, and whether time counts steps or is an input.
+        prefix: of all names.
+        bytes_held: of the window in C.
+    """
+    late = f"{prefix}_window_late"
+    # How late: in steps, or as an age where the time step is an input.
+    if window.time is None:
+        when = [
+            f"{late} takes a measurement of an earlier step: of the newest one where `steps`",
+            f"is 0, of the one before where it is 1, up to {window.steps}. What z has is filled into that step, and",
+        ]
+        refused_ages = ""
+    else:
+        when = [
+            f"{late} takes a measurement of a time `age` before the newest step, in the unit of",
+            f"{TIME_STEP}. A step of that time, to rounding, is filled; else one is made, with the inputs that led to",
+            f"the one after it, whose {TIME_STEP} is divided. At most {window.rows} are held, also of those made, and",
+        ]
+        refused_ages = "by 6 an age that is negative or not finite; "
+    return [
+        "",
+        f"Measurements that come late: call {prefix}_window_start and {prefix}_window_step in place of {prefix}_start",
+        f"and {prefix}_step; the estimate is that of the state `now`, as {prefix}_mean(&window.now).",
+        *when,
+        "all from it on are run again: the estimate is that of measurements in order, to rounding. Refused is, and",
+        "leaves the estimate as it was, by 8 what is before all that is held, counted in `late`; by 9 a component that",
+        f"is there already, counted in `held`; {refused_ages}and, by the code of {prefix}_step, one",
+        "that would have its own step refused, or one after it.",
+        f"sizeof({prefix}_window) is {bytes_held:,}. {prefix}_window_step takes the time of one step,",
+        f"{late} that of at most {window.places}, or {2 * window.places} where a step is refused.",
+    ]
+
+
+def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
+    """Return the text of the window's functions, and of those that they share."""
+    received, inputs = window.received, window.inputs
+    missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"
+    nothing = f"    if ({missing}) {{ return 0; }} /* nothing arrived */"
+    names = {
+        "p": prefix,
+        "real": real,
+        "places": f"{window.places}U",
+        "rows": f"{window.rows}U",
+        "check": "\n".join([*(f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(received)), nothing]),
+        "copy_z": _generate_array_copy("row->z", "z", received),
+        "copy_u": _generate_array_copy("row->u", "u", inputs),
+        "received": received,
+        "head": _list_function_heads(window, prefix, real)[2],
+    }
+    late = _LATE_STEP if window.time is None else _LATE_TIME
+    if window.time is not None:
+        names |= {"dt": window.time, "rounding": _format_literal(window.places * DIGITS[real], real)}
+    return [text.format(**names) for text in (_PLACE, _RUN, _FILL, _START, _STEP, late)]
+
+
+def _generate_array_copy(target: str, source: str, count: int) -> str:
+    """Return the statements that copy an array; none of an empty one."""
+    if not count:
+        return f"    (void){source};"
+    return f"    for (int c = 0; c < {count}; ++c) {{ {target}[c] = {source}[c]; }}"
+
+
+def _format_literal(number: float, real: Real) -> str:
+    """Return a literal of the type."""
+    return f"{number:.3e}" + ("f" if real == "float" else "")
+
+
+_PLACE = """static {p}_row *{p}_row_at({p}_window *window, uint32_t i)
+{{
+    return &window->rows[(window->first + i) % {places}];
+}}"""
+
+_RUN = """/* Run the rows from one on again; the estimate changes only where none is refused. */
+static int {p}_run_again({p}_window *window, uint32_t i)
+{{
+    {p}_state state = {p}_row_at(window, i)->before;
+    for (uint32_t k = i; k < window->count; ++k) {{
+        {p}_row *row = {p}_row_at(window, k);
+        row->before = state;
+        const int refused = {p}_step(&state, row->z, row->u);
+        if (refused != 0) {{ return refused; }}
+    }}
+    window->now = state;
+    return 0;
+}}"""
+
+_FILL = """/* Fill what arrived into a row and run again; what is refused leaves all as it was. */
+static int {p}_fill({p}_window *window, uint32_t i, const {real} z[])
+{{
+    {p}_row *row = {p}_row_at(window, i);
+    for (int c = 0; c < {received}; ++c) {{
+        if ((isnan(z[c]) == 0) && (isnan(row->z[c]) == 0)) {{
+            ++window->held;
+            return 9;
+        }}
+    }}
+    for (int c = 0; c < {received}; ++c) {{
+        if (isnan(z[c]) == 0) {{ row->z[c] = z[c]; }}
+    }}
+    const int refused = {p}_run_again(window, i);
+    if (refused != 0) {{
+        for (int c = 0; c < {received}; ++c) {{
+            if (isnan(z[c]) == 0) {{ row->z[c] = NAN; }}
+        }}
+        (void){p}_run_again(window, i);
+    }}
+    return refused;
+}}"""
+
+_START = """void {p}_window_start({p}_window *window)
+{{
+    {p}_start(&window->now);
+    window->first = 0U;
+    window->count = 0U;
+    window->late = 0U;
+    window->held = 0U;
+}}"""
+
+_STEP = """int {p}_window_step({p}_window *window, const {real} z[], const {real} u[])
+{{
+    {p}_state after = window->now;
+    const int refused = {p}_step(&after, z, u);
+    if (refused != 0) {{ return refused; }}
+    /* The row takes the place behind the newest one, or that of the oldest. */
+    if (window->count == {rows}) {{
+        window->first = (window->first + 1U) % {places};
+        --window->count;
+    }}
+    {p}_row *row = {p}_row_at(window, window->count);
+    row->before = window->now;
+{copy_z}
+{copy_u}
+    ++window->count;
+    window->now = after;
+    return 0;
+}}"""
+
+_LATE_STEP = """{head}
+{{
+{check}
+    if (steps >= window->count) {{
+        ++window->late;
+        return 8;
+    }}
+    return {p}_fill(window, window->count - 1U - steps, z);
+}}"""
+
+_LATE_TIME = """/* Make a row before row i with what is left of its time step when it keeps `rest` of it. */
+static int {p}_make_row({p}_window *window, uint32_t i, {real} rest, const {real} z[])
+{{
+    const {real} whole = {p}_row_at(window, i)->u[{dt}];
+    for (uint32_t k = window->count; k > i; --k) {{ *{p}_row_at(window, k) = *{p}_row_at(window, k - 1U); }}
+    {p}_row *row = {p}_row_at(window, i);
+{copy_z}
+    row->u[{dt}] = whole - rest;
+    {p}_row_at(window, i + 1U)->u[{dt}] = rest;
+    ++window->count;
+    const int refused = {p}_run_again(window, i);
+    if (refused != 0) {{
+        /* As if there had been none. */
+        const {p}_state before = row->before;
+        for (uint32_t k = i + 1U; k < window->count; ++k) {{ *{p}_row_at(window, k - 1U) = *{p}_row_at(window, k); }}
+        --window->count;
+        row->before = before;
+        row->u[{dt}] = whole;
+        (void){p}_run_again(window, i);
+    }} else if (window->count > {rows}) {{
+        window->first = (window->first + 1U) % {places};
+        --window->count;
+    }}
+    return refused;
+}}
+
+{head}
+{{
+{check}
+    if ((isfinite(age) == 0) || (age < 0)) {{ return 6; }}
+    /* The age of row i, and of the state before it. */
+    {real} since = 0;
+    for (uint32_t i = window->count; i > 0U; --i) {{
+        const {real} before = since + {p}_row_at(window, i - 1U)->u[{dt}];
+        if (age <= since * (1 + {rounding})) {{ return {p}_fill(window, i - 1U, z); }}
+        if (age < before * (1 - {rounding})) {{ return {p}_make_row(window, i - 1U, age - since, z); }}
+        since = before;
+    }}
+    ++window->late;
+    return 8;
+}}"""

@@ -1,0 +1,67 @@
+"""What single precision leaves of numbers that are far from zero, as the header says it of a filter."""
+
+import math
+
+import numpy as np
+
+from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.over_time import first
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.random_affine.noise import AbstractNoise
+
+SHARE = 0.01  # of a measurement's noise that its rounding may be
+HALF_UNIT = 2.0**-24  # by which single precision rounds, of the number
+
+
+def explain_ranges(filter: AbstractFilter) -> list[str]:
+    """Return a note for each component of z, up to which size its rounding is small beside its noise; "" if unknown."""
+    deviations = _find_noise_deviations(filter)
+    if deviations is None:
+        return [""] * filter.received
+    return [f" (up to {_round_down(SHARE * x / HALF_UNIT):g}, see below)" if x > 0 else "" for x in deviations]
+
+
+def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
+    """Return lines for the header: on the ranges of z, if some have one, and on the part of the mean that is apart."""
+    lines = [
+        "Up to the size that is noted, single precision rounds a component of z by a hundredth of its noise at most;",
+        "beyond it take an origin off before it becomes a float, and off plant and sensor.",
+    ]
+    apart = [
+        "mean is rounded to single precision. What that leaves out of mean[i] is state->low[i]: take an origin off",
+        "mean[i] first, and then add it.",
+    ]
+    return [*(lines if ranged else []), *(apart if isinstance(filter.init(), SplitMeanGaussian) else [])]
+
+
+def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:
+    """Return the standard deviation of the noise of each component of z (received,); None of a filter that has none.
+
+    The noise of z is M v + n: the sensor's noise v times the link's mean gain M, and the link's own noise n. A filter
+    of which no sensor is known, or whose noise depends on the inputs, says none.
+    """
+    premise = filter.premise
+    sensor = None if premise is None or premise.sensor is None else first(premise.sensor)
+    if premise is None or sensor is None or not isinstance(sensor.noise, AbstractNoise):
+        return None
+    noise, link = np.asarray(sensor.noise.covariance), premise.channel and first(premise.channel)
+    variances: np.ndarray = np.diagonal(noise)
+    if isinstance(link, AbstractRandomAffine):
+        try:
+            moments = second_order(link)
+        except ValueError:  # a link that remembers what it did before
+            return None
+        # The link's noise has the covariance C diag(weights) C', C the columns.
+        gain, columns, weights = map(np.asarray, (moments.mean_gain, *moments.noise))
+        if gain.shape[1] != len(noise):  # a link of what was sent before as well
+            return None
+        variances = np.diagonal(gain @ noise @ gain.T) + columns**2 @ weights
+    return np.sqrt(variances) if len(variances) == filter.received else None
+
+
+def _round_down(number: float) -> float:
+    """Return a positive number to two digits, not above it."""
+    unit = 10.0 ** (math.floor(math.log10(number)) - 1)
+    return math.floor(number / unit) * unit

@@ -1,0 +1,129 @@
+"""A filter's step as functions of arrays that C can have: whole, or apart as its prediction and its correction."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement
+from heliograph.model.checks.plant_inputs import do_inputs_spoil
+from heliograph.model.estimate import Innovation
+from heliograph.numerics.types import PyTree
+
+ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
+PRECISION = {"double": np.float64, "float": np.float32}
+
+
+class PartOfStep(NamedTuple):
+    """A function of arrays that becomes one of C: the step, its prediction or its correction.
+
+    Args:
+        name: "step", "predict" or "correct".
+        data: names of the data, "z", "u" or both.
+        function: from (arrays of the state, data, number of the step) to arrays of the state, mean, covariance, and
+            what is `beside`.
+        examples: arguments that it takes.
+        beside: names of the other results. "implausible": the estimate would lose its digits, and what was computed
+            must not be used; "spoilt": an input has too few digits.
+    """
+
+    name: str
+    data: tuple[str, ...]
+    function: Callable[..., list[jax.Array]]
+    examples: tuple[Any, ...]
+    beside: tuple[str, ...]
+
+
+def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
+    """Return the step, or apart its prediction and its correction, for numbers of type `real`.
+
+    A measurement that differs from what was expected by less than `ROUNDING` of itself is used, however small its
+    deviations are: after many steps its expectation is rounded by as much (and below 1e-33 has few digits).
+    """
+    leaves, tree = jax.tree.flatten(filter.init())
+    z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)  # of these, only shapes count
+    flags = ("implausible", "spoilt")
+    if not apart:
+        return [
+            PartOfStep(
+                "step", ("z", "u"), _make_step_function(filter, tree, real), examples=(leaves, z, u, k), beside=flags
+            )
+        ]
+    # Whether a correction weighs components is seen of one.
+    _state, innovation = filter.correct(filter.predict(filter.init(), u, 0), z, 0)
+    has_weights = innovation.weight is not None
+    news = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
+    return [
+        PartOfStep(
+            "predict", ("u",), _make_prediction_function(filter, tree, real), examples=(leaves, u, k), beside=flags
+        ),
+        PartOfStep(
+            "correct", ("z",), _make_correction_function(filter, tree, real), examples=(leaves, z, k), beside=news
+        ),
+    ]
+
+
+def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of a whole step; `tree` is the structure of a state, of which C has the arrays."""
+
+    @jax.jit
+    def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate and two flags after a step."""
+        after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
+        implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, implausible, spoilt]
+
+    return step
+
+
+def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of the prediction alone; `tree` is the structure of a state."""
+
+    @jax.jit
+    def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate and two flags after a prediction."""
+        before = jax.tree.unflatten(tree, arrays)
+        prior = filter.predict(before, u, k)
+        estimates = filter.estimate(before), filter.estimate(prior)
+        spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
+        judgement = Judgement.judge_prediction(filter.claim, (before, prior), estimates, spoilt)
+        return [*jax.tree.leaves(prior), estimates[1].mean, estimates[1].covariance, judgement.input > 0, spoilt]
+
+    return predict
+
+
+def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+    """Return the function of the correction alone, which tells innovation, distance and weights as well."""
+
+    @jax.jit
+    def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
+        """Return state, estimate, a flag, and what a correction tells."""
+        prior = jax.tree.unflatten(tree, arrays)
+        after, innovation = filter.correct(prior, z, k)
+        expected, estimate = filter.estimate(prior), filter.after_step(after, k)
+        judgement = Judgement.judge_correction(
+            filter.claim, (prior, after), (expected, estimate), innovation, z, filter.of_atoms
+        )
+        implausible = is_implausible(innovation, z, ROUNDING[real])
+        beside = [implausible, innovation.value, judgement.distance, judgement.arrived]
+        weight = [] if innovation.weight is None else [innovation.weight]
+        return [*jax.tree.leaves(after), estimate.mean, estimate.covariance, *beside, *weight]
+
+    return correct
+
+
+def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
+    """Return whether some component is larger than expected, and too many of its own deviations away from that.
+
+    The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
+    z, such as a neighbour's measurement, every component that is so far away counts.
+    """
+    far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
+    if differs.shape == z.shape:
+        larger = jnp.abs(z) > jnp.abs(z - innovation.value)
+        far &= larger & (differs > rounding * jnp.maximum(jnp.abs(z), 1e-33))
+    return jnp.any(far)

@@ -1,0 +1,269 @@
+"""One step of a filter as functions of C: from state, measurement and inputs to the state after, and to flags."""
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.export.step_parts import PartOfStep, make_parts_of_step
+from heliograph.factors.gaussian import Gaussian, from_covariance
+from heliograph.factors.two_part_mean import SplitMeanGaussian, centred_from_covariance
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.types import PyTree
+from straightline import Unsupported, to_c
+
+Real = Literal["double", "float"]
+RESERVED = frozenset((
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
+    "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
+    "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+))  # fmt: skip
+ADDED = frozenset(("step", "estimate_mean", "estimate_covariance", "z", "u"))  # names beside the filter's state
+SAME = 1e-6  # deviations to which a covariance's factors give it back
+
+
+class StateMember(NamedTuple):
+    """An array in the state of the step: its name, and its numbers before the first step."""
+
+    name: str
+    start: np.ndarray
+
+
+class StepProgram(NamedTuple):
+    """A step as functions of C.
+
+    Args:
+        filter: the filter.
+        members: arrays of the state in C: those of the filter's state, then mean and covariance of the estimate, unless
+            these are arrays of the state themselves.
+        read: the members that a step reads: those of the filter's state.
+        parts: the whole step, or prediction and correction.
+        computes: their functions in C, from `read`, the data and the step's number to `members` and what is beside.
+        initial: the function in C that makes the first state.
+        start_at: the one that makes the state of a mean and a covariance; None of a state that is more than these.
+        mean: name of the member that holds the estimate's mean.
+        covariance: name of the member that holds its covariance.
+        counts: whether the step's number is part of the state.
+    """
+
+    filter: AbstractFilter
+    members: list[StateMember]
+    read: list[StateMember]
+    parts: list[PartOfStep]
+    computes: list[Any]
+    initial: Any
+    start_at: Any
+    mean: str
+    covariance: str
+    counts: bool
+
+    @property
+    def operations(self) -> dict[str, int]:
+        """Return the number of each operation in a step."""
+        counts = [code.operations for code in self.computes]
+        return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
+
+
+def lower_step_to_c_functions(
+    filter: AbstractFilter, real: Real, prefix: str, apart: bool = False, size: bool = False
+) -> StepProgram:
+    """Lower one step of a filter from JAX to functions of C; return them with the arrays of the state that they move.
+
+    Args:
+        filter: the filter.
+        real: type of numbers in C.
+        prefix: of the functions' names.
+        apart: whether prediction and correction are two functions; else they are one.
+        size: whether loops stay loops; then it is traced within `write_short_programs`.
+
+    Raises:
+        ValueError: random numbers, or operations that are not supported; with the operation and its place.
+    """
+    state = filter.init()
+    read, of_estimate = _make_state_members(state, filter.estimate(state))
+    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
+    try:
+        symmetric = _find_symmetric_arrays(parts)
+        # Mean and covariance of the estimate become members of their own only where no array of the state has the same
+        # numbers after every part. So all are written once to see which results are the same; `holders` are the
+        # numbers of the two candidates that hold mean and covariance, the highest where parts differ.
+        with_all = [_lower_part_to_c(part, symmetric, prefix, real, size) for part in parts]
+        numbers = range(len(read), len(candidates))
+        holders = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
+        kept = [*range(len(read)), *(n for n in holders if n >= len(read))]
+        members = [candidates[n] for n in kept]
+        computes = [_lower_part_to_c(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
+        names, starts = [m.name for m in members], [m.start for m in members]
+        initial = to_c(lambda: starts, name=f"{prefix}_initial", single=real == "float", names=((), names))
+        # A state that is nothing but a mean and a covariance can be set to others.
+        can_be_set = isinstance(state, Gaussian | SplitMeanGaussian) and apart
+        start_at = _lower_start_to_c(filter, kept, names, prefix, real) if can_be_set else None
+    except Unsupported as error:
+        raise make_unsupported_error(error.operation, error.where) from None
+    mean, covariance = (candidates[n].name for n in holders)
+    # The number of the step is the last argument of each part.
+    uses_step_number = any(code.arguments[-1].used for code in computes)
+    return StepProgram(
+        filter=filter,
+        members=members,
+        read=read,
+        parts=parts,
+        computes=computes,
+        initial=initial,
+        start_at=start_at,
+        mean=mean,
+        covariance=covariance,
+        counts=uses_step_number or filter.horizon is not None,
+    )
+
+
+def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMember], list[StateMember]]:
+    """Return members of the state in C: the arrays of the filter's state, and the estimate's mean and covariance."""
+    named_arrays = zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
+    of_state = [StateMember(name, np.asarray(array)) for name, array in named_arrays]
+    of_estimate = [
+        StateMember("estimate_mean", np.asarray(estimate.mean)),
+        StateMember("estimate_covariance", np.asarray(estimate.covariance)),
+    ]
+    return of_state, of_estimate
+
+
+def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:
+    """Return the first result that is always equal to this one, before the first step too; itself where none is."""
+    same = [n for n in range(number) if code.results[n].same == code.results[number].same]
+    start = named[number].start
+    return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
+
+
+def _lower_part_to_c(
+    part: PartOfStep,
+    symmetric: set[int],
+    prefix: str,
+    real: Real,
+    size: bool = False,
+    kept: Sequence[int] | None = None,
+    names: tuple[Sequence[StateMember], Sequence[StateMember]] = ((), ()),
+) -> Any:
+    """Lower a part of a step from JAX to a function of C and return that; all arguments but the measurement are finite.
+
+    Args:
+        part: the part, a function of the state's arrays, the data and the step's number. Its results are in this order
+            the state's arrays, the estimate's mean and covariance, and what it has beside these, such as flags.
+        symmetric: which arrays of the state are symmetric.
+        prefix: of its name.
+        real: type of its numbers.
+        size: whether it is to be small, in loops.
+        kept: which arrays of state and estimate are results; all by default.
+        names: the members that are read, and those that are results; used where `kept` is given.
+    """
+    state_count = len(part.examples[0])
+    beside = state_count + 2  # number of the first result behind mean and covariance
+
+    def choose_results(*arguments: Any) -> list[jax.Array]:
+        """Return the results that are kept, then those beside state and estimate."""
+        results = part.function(*arguments)
+        return results if kept is None else [*(results[n] for n in kept), *results[beside:]]
+
+    array_names: tuple[list[str], list[str]] = ([], [])  # of arguments, and of results: by default those of `to_c`
+    if kept is not None:
+        read, members = ([m.name for m in some] for some in names)
+        array_names = [*read, *part.data, "step"], [*(f"next_{name}" for name in members), *part.beside]
+    # Arguments that are finite, by number: arrays of the state, data but z (NaN: did not arrive), the step's number.
+    finite_data = [state_count + n for n, name in enumerate(part.data) if name != "z"]
+    step_number = state_count + len(part.data)
+    return to_c(
+        choose_results,
+        *part.examples,
+        name=f"{prefix}_compute" if part.name == "step" else f"{prefix}_compute_{part.name}",
+        single=real == "float",
+        names=array_names,
+        finite={*range(state_count), *finite_data, step_number},
+        symmetric=symmetric,
+        short=size,
+    )
+
+
+def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+    """Lower to C, and return, the function that makes the members of a state from a mean and a covariance.
+
+    Its last result, `none`, is a flag: the arguments are no finite mean, or no covariance. The state keeps factors of
+    the covariance. An indefinite matrix is changed by its factoring, so the product of these factors differs from it:
+    by this it is refused.
+
+    The results have the names of those of a step, `next_` and the member's, since both write the members of a state.
+
+    Args:
+        filter: the filter.
+        kept: which arrays of state and estimate are members.
+        names: of the members.
+        prefix: of the function's name.
+        real: type of its numbers.
+    """
+    make_state = centred_from_covariance if isinstance(filter.init(), SplitMeanGaussian) else from_covariance
+
+    @jax.jit
+    def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
+        """Return the members of the state of a mean and covariance, and whether these are invalid."""
+        state = make_state(mean, covariance)
+        estimate = filter.estimate(state)
+        results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
+        deviations = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))
+        difference = jnp.abs(jnp.asarray(estimate.covariance) - covariance)  # of the product of factors from the matrix
+        is_covariance = jnp.all(difference <= SAME * jnp.outer(deviations, deviations))
+        is_valid = is_covariance & jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
+        return [*(results[n] for n in kept), ~is_valid]
+
+    n = len(filter.states)
+    return to_c(
+        start_from_moments,
+        np.zeros(n),
+        np.eye(n),
+        name=f"{prefix}_compute_start",
+        single=real == "float",
+        names=(["mean", "covariance"], [*(f"next_{name}" for name in names), "none"]),
+    )
+
+
+def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
+    """Return which arrays of the state are always symmetric, of which one triangle is read.
+
+    By induction: symmetric at the start, and after each part from symmetric ones. Assume all, drop those that are not.
+    """
+    leaves = parts[0].examples[0]
+    symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
+    while symmetric:
+        codes = [_lower_part_to_c(part, symmetric, "step", "double") for part in parts]
+        lost = {n for n in symmetric if not all(code.results[n].symmetric for code in codes)}
+        if not lost:
+            break
+        symmetric -= lost
+    return symmetric
+
+
+def make_unsupported_error(operation: str, where: str) -> InputError:
+    """Return an error, in one line, about an operation that cannot be exported."""
+    return fail("export", "operations that C has", f"{operation} at {where}")
+
+
+def name_state_arrays(state: PyTree) -> list[str]:
+    """Return names in C for the arrays of a state, from their field names; the Gaussian that it holds has no name."""
+    names: list[str] = []
+    for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
+        # Each key of the path is that of an attribute, of a dictionary, or a place in a sequence.
+        parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
+        joined = "_".join(part for part in parts if part != "gaussian")
+        text = "".join(c if c.isalnum() and c.isascii() else "_" for c in joined)
+        text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
+        while text in RESERVED | ADDED or text in names:
+            text += "_"
+        names.append(text)
+    return names
+
+
+def _is_symmetric(value: np.ndarray) -> bool:
+    """Return whether an array is a symmetric matrix of more than one row."""
+    return value.ndim == 2 and len(value) > 1 and np.array_equal(value, value.T)

@@ -1,0 +1,308 @@
+"""Messages of a bag decoded many at once: fields whose places are fixed by the lengths of texts and lists."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from heliograph.files.event_table import NONE, EventTable
+from heliograph.files.sources.computed_values import Computed
+from heliograph.files.sources.json_field import Source
+from heliograph.files.sources.sources import SECOND, Sources
+from heliograph.numerics.check import InputError
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+NUMBERS = {f"{kind}{bits}": bits // 8 for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
+NUMBERS |= {"float32": 4, "float64": 8, "bool": 1}
+HEAD = 0x100  # of CDR, little end first: numbers are aligned to their size, counted from after these four bytes
+MOST_LENGTHS = 64  # in a message; one with more is decoded alone
+FEWEST = 5  # messages of a topic and size on average; where they are fewer each is decoded alone
+STAMP = ("sec", "nanosec")
+
+
+class RawMessage(NamedTuple):
+    """Message of a bag as it is stored: its topic with its type, the time it was logged in nanoseconds, its bytes."""
+
+    connection: "Connection"
+    logged: int
+    data: bytes
+
+
+class LayoutNotFixedError(Exception):
+    """A message whose fields cannot be read by fixed places: it is decoded alone, which says why if it fails."""
+
+
+class MessageLayout:
+    """Places of the wanted fields in a message, and the lengths of texts and lists that put them there.
+
+    Messages of the same size with the same lengths at the same places have all fields at the same places.
+
+    Args:
+        definitions: fields by type of message, as rosbags has them.
+        kind: type of the message.
+        data: a message.
+        paths: dotted paths of the numbers to read.
+
+    Raises:
+        LayoutNotFixedError: another encoding, a wanted field that is no number, a message that ends elsewhere.
+    """
+
+    def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
+        """Find where the fields at `paths` stand in messages laid out as `data`; LayoutNotFixedError if one cannot be.
+
+        `definitions`: fields of each type of messages; `kind`: type of this one.
+        """
+        self._definitions, self._data, self._paths = definitions, data, paths
+        self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
+        self._note_length(0)
+        end = self._locate_message_numbers(4, kind, "")
+        if self.lengths[0] != HEAD or not 0 <= len(data) - end < 4 or paths != self.fields.keys():
+            raise LayoutNotFixedError  # a message is filled up to four bytes at most
+
+    def fits(self, table: np.ndarray) -> np.ndarray:
+        """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
+        fits = np.ones(len(table), dtype=bool)
+        for begin, length in self.lengths.items():
+            fits &= _decode_column(table, begin, "uint32") == length
+        return fits
+
+    def read_columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
+        """Return each wanted field of messages of this layout, (messages,)."""
+        return {path: _decode_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
+
+    def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
+        """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
+
+        `prefix`: path of the message in the whole one, with a dot; "" for that itself.
+        """
+        if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
+            raise LayoutNotFixedError
+        for name, (node, of) in self._definitions[kind][1]:
+            begin = self._locate_field_numbers(begin, str(node.name), of, prefix + name)
+        return begin
+
+    def _locate_field_numbers(self, begin: int, node: str, of: Any, path: str) -> int:
+        """Note where the wanted numbers of one field stand in a message's bytes; return where the next field begins.
+
+        The bytes are those of CDR, the encoding of ROS 2: each number is aligned to its size.
+
+        Args:
+            begin: the byte behind the field before it.
+            node: what the field is, as rosbags names it: "NAME" of a message, "BASE" of a number or text, "ARRAY" or
+                "SEQUENCE" of a list of fixed or of any length.
+            of: of "NAME" the message's type; of "BASE" the basic type, first in a tuple; of a list what each of its
+                items is, as a pair like `node` and `of`, and how many there are ("SEQUENCE": at most).
+            path: dotted path of the field in the whole message.
+        """
+        if node == "NAME":
+            return self._locate_message_numbers(begin, of, f"{path}.")
+        if node == "BASE" and of[0] == "string":  # four bytes with its length, then its text
+            begin = _align_to_size(begin, 4)
+            return begin + 4 + self._note_length(begin)
+        if node == "BASE":
+            return self._locate_numbers_in_row(begin, of[0], 1, [path])
+        (item_node, item_of), count = of
+        if node == "SEQUENCE":  # the length that it has in this message stands before its items
+            begin = _align_to_size(begin, 4)
+            count, begin = self._note_length(begin), begin + 4
+        if item_node.name == "BASE" and item_of[0] in NUMBERS:  # all at once: a list may have millions of numbers
+            is_wanted = any(name.startswith(f"{path}.") for name in self._paths)
+            names = [f"{path}.{i}" for i in range(count)] if is_wanted else []
+            return self._locate_numbers_in_row(begin, item_of[0], count, names)
+        for i in range(count):
+            begin = self._locate_field_numbers(begin, item_node.name, item_of, f"{path}.{i}")
+        return begin
+
+    def _locate_numbers_in_row(self, begin: int, kind: str, count: int, names: list[str]) -> int:
+        """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last."""
+        size = NUMBERS.get(kind)
+        if size is None:
+            raise LayoutNotFixedError
+        begin = _align_to_size(begin, size) if count else begin
+        for i, name in enumerate(names):
+            if name in self._paths:
+                self.fields[name] = begin + i * size, kind
+        return begin + count * size
+
+    def _note_length(self, begin: int) -> int:
+        """Return the length that stands at this byte, and note it: messages of the layout all have it there."""
+        length = int.from_bytes(self._data[begin : begin + 4], "little")
+        self.lengths[begin] = length
+        if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
+            raise LayoutNotFixedError
+        return length
+
+
+class BatchDecoder:
+    """Decodes messages of mapped topics, many at once: values, stamps and counts as arrays.
+
+    Args:
+        reader: the bag.
+        sources: sources of the network.
+    """
+
+    def __init__(self, reader: "AnyReader", sources: Sources):
+        self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
+        self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
+
+    def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
+        """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
+
+        What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
+        """
+        try:
+            readings = self._read_by_node(batch)
+        except LayoutNotFixedError:
+            return False
+        for node, blocks in readings.items():
+            # In the order in which the messages came.
+            rows = np.concatenate([block.rows for block in blocks])
+            order = np.argsort(rows, kind="stable")
+            logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
+            table.add_many(
+                node,
+                arrival=logged,
+                time=np.concatenate([block.time for block in blocks])[order],
+                sequence=np.concatenate([block.sequence for block in blocks])[order],
+                values=np.concatenate([block.values for block in blocks])[order],
+                period=blocks[-1].period,
+            )
+        return True
+
+    def _read_by_node(self, batch: Sequence[RawMessage]) -> "dict[str, list[NodeReadings]]":
+        """Return the readings of each node, a block for the messages of one topic, size and layout.
+
+        Raises:
+            LayoutNotFixedError: messages that need a look at each.
+        """
+        if not self._is_ros2:  # bags of ROS 1 are encoded otherwise
+            raise LayoutNotFixedError
+        # By topic and size: the numbers of the messages.
+        groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[NodeReadings]](list)
+        for i, message in enumerate(batch):
+            groups[message.connection.topic, len(message.data)].append(i)
+        if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
+            raise LayoutNotFixedError
+        for (topic, _), numbers in groups.items():
+            table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
+            for rows, columns in self._yield_rows_by_layout(batch[numbers[0]].connection, table):
+                for source, _, places in self._sources.of(topic):
+                    # The node, and the places of its values: one, as `_list_paths_of_numbers` refuses others.
+                    ((node, outputs),) = places.items()
+                    size = len(self._sources.names[node])
+                    results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
+        return results
+
+    def _yield_rows_by_layout(
+        self, connection: "Connection", table: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Yield the rows that have one layout, and their wanted fields by path, until all messages are covered.
+
+        Args:
+            connection: topic and type of the messages.
+            table: the messages, all of one size, (messages, bytes).
+        """
+        known = self._layouts[connection.topic, table.shape[1]]
+        left, index = np.arange(len(table)), 0
+        # One known layout after another; where none is left, a new one by the first message that has none.
+        while len(left):
+            if index == len(known):
+                paths = {
+                    path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
+                }
+                known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
+            fits = known[index].fits(table[left])
+            yield left[fits], known[index].read_columns(table[left[fits]])
+            left, index = left[~fits], index + 1
+
+
+class NodeReadings(NamedTuple):
+    """Readings of a node: numbers of their messages, times (`NONE`: none), counts (-1: none), and values.
+
+    Shapes: rows, time and sequence (readings,), values (readings, outputs).
+    """
+
+    rows: np.ndarray
+    time: np.ndarray
+    sequence: np.ndarray
+    values: np.ndarray
+    period: int
+
+
+def _list_paths_of_numbers(source: Source) -> list[str]:
+    """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
+    if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
+        raise LayoutNotFixedError
+    stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
+    values = [part for path in source.paths for part in _list_component_paths(path)]
+    return [*values, *stamp, *([] if source.sequence is None else [source.sequence.path])]
+
+
+def _list_component_paths(path: str | Computed) -> tuple[str, ...]:
+    """Return the paths of the numbers of which a value is computed; that of the value itself if it is not."""
+    return (path,) if isinstance(path, str) else path.parts
+
+
+def _make_node_readings(
+    rows: np.ndarray, columns: dict[str, np.ndarray], source: Source, places: np.ndarray, size: int
+) -> NodeReadings:
+    """Return the readings of one source from the fields of many messages.
+
+    Args:
+        rows: numbers of the messages, (messages,).
+        columns: their fields by path, (messages,) each.
+        source: the source.
+        places: index of each of its values among those that its node receives.
+        size: how many values the node receives.
+
+    Raises:
+        LayoutNotFixedError: a stamp, a count or part of a value that is none; reading message by message then names it.
+    """
+    values = np.full((len(rows), size), np.nan)
+    for place, path, scale, offset in zip(places, source.paths, source.scale, source.offset, strict=True):
+        value = _compute_value_column(columns, path)
+        values[:, place] = np.where(np.isfinite(value), scale * value + offset, np.nan)
+    # A stamp has to be set, so not 0, and of 32 bits, so that the nanoseconds fit into 64.
+    time = np.full(len(rows), NONE)
+    if source.time is not None:
+        seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
+        time = seconds.astype(np.int64) * SECOND + nanoseconds
+        if seconds.dtype.itemsize > 4 or np.any(time == 0):
+            raise LayoutNotFixedError
+        time += source.time.shift
+    if source.sequence is None:
+        return NodeReadings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
+    # A count has to be a whole number from 0 on.
+    sequence = columns[source.sequence.path]
+    if sequence.dtype.kind not in "iu" or np.any(sequence.astype(np.int64) < 0):
+        raise LayoutNotFixedError
+    return NodeReadings(rows, time, sequence.astype(np.int64), values, source.sequence.period)
+
+
+def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
+    """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
+
+    Raises:
+        LayoutNotFixedError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.
+    """
+    numbers = [columns[part].astype(np.float64) for part in _list_component_paths(path)]
+    parts = [np.where(np.isfinite(number), number, np.nan) for number in numbers]
+    try:
+        return parts[0] if isinstance(path, str) else np.asarray(path.of(*parts))
+    except InputError:
+        raise LayoutNotFixedError from None
+
+
+def _decode_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
+    """Return the number of a kind at byte `begin` of each message of a table of bytes, (messages,)."""
+    column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
+    return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
+
+
+def _align_to_size(begin: int, size: int) -> int:
+    """Return the next byte from this one on that a number of a size may have."""
+    return 4 + -(-(begin - 4) // size) * size

@@ -1,0 +1,229 @@
+"""Messages in JSON or Protocol Buffers in MCAP files, as viewers and loggers without ROS write them."""
+
+import os
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from io import BytesIO
+from itertools import takewhile
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from heliograph.files.bags.protobuf import ProtobufSchema
+from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, BagDamagedError
+from heliograph.files.messages.message_files import FileMessage
+from heliograph.files.sources.sources import Sources
+from heliograph.files.text.text_file import CutOffError
+from heliograph.numerics.check import InputError, error_text, fail
+
+SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x03, 0x04, 0x05, 0x06  # kinds of records
+RECORD = struct.Struct("<BQ")  # kind and length of a record
+HEADER = struct.Struct("<HIQQ")  # of a message: channel, count, times of logging and publishing
+PART = struct.Struct("<QQQI")  # of a chunk: first and last time, size and checksum of its content
+LENGTH, SIZE, NUMBER = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<H")
+END = struct.Struct("<BQQQI")  # a footer: kind, length, where the summary begins, where its offsets do, checksum
+JSON, PROTOBUF = "json", "protobuf"
+BARE = "protobuf without its schema"
+OTHERS = {BARE, "flatbuffer", "cbor", "msgpack"}  # encodings of MCAP's registry that nothing here reads
+
+
+class McapChannel(NamedTuple):
+    """A channel of an MCAP file: its topic, how its messages are encoded, and the number of their schema."""
+
+    topic: str
+    encoding: str
+    schema: int
+
+
+class ProtobufType(NamedTuple):
+    """Name of a message type of Protocol Buffers, and the schema of the file, by which its messages are decoded."""
+
+    name: str
+    schema: ProtobufSchema
+
+
+def holds_messages(path: Path) -> bool:
+    """Return whether a file is MCAP with messages in JSON or Protocol Buffers.
+
+    Raises:
+        ValueError: MCAP whose messages are all of an encoding that is not read.
+    """
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            channels = _find_channels(file)
+    except Exception:  # damage, which whoever reads the file reports
+        return False
+    encodings = {channel.encoding for channel in channels}
+    if encodings and encodings <= OTHERS:
+        raise fail(str(path), "messages of ROS, in JSON, or in Protobuf with its schema", ", ".join(sorted(encodings)))
+    return bool(encodings & {JSON, PROTOBUF})
+
+
+def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
+
+    Messages in other encodings have no content; one that its schema does not fit is an error.
+
+    Where the file is damaged or cut off the last is a `CutOffError`.
+
+    Args:
+        path: the file.
+        sources: sources, whose topics are in JSON or Protocol Buffers; None for all topics.
+
+    Raises:
+        ValueError: a topic of the sources that is in another encoding; one line.
+    """
+    count = 0
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        try:
+            for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
+                where = f"{path}, message {count}"
+                wanted = sources is None or bool(sources.of(channel.topic))
+                payload = _decode_payload(where, channel, types, data) if wanted else None
+                if isinstance(payload, InputError):
+                    yield payload
+                else:
+                    yield FileMessage(where, channel.topic, payload, np.datetime64(logged, "ns"))
+        except InputError as error:
+            if not isinstance(error, BagDamagedError):
+                raise
+            yield CutOffError(f"{error}; what was read before it stays")
+        except Exception as error:  # whatever damage makes a reader do
+            why = fail(f"{path}, after message {count}", "a file without damage", error_text(error))
+            yield CutOffError(f"{why}; what was read before it stays")
+
+
+class _StoredMessage(NamedTuple):
+    """A message as it stands in the file: its number from 1, its channel, when it was logged, its bytes, known types.
+
+    `types`: of messages in Protocol Buffers, by the number of their schema.
+    """
+
+    number: int
+    channel: McapChannel
+    logged: int
+    data: bytes
+    types: dict[int, ProtobufType]
+
+
+def _yield_stored_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
+    """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
+
+    Raises:
+        ValueError: a topic of the sources in an encoding that is not read.
+        Exception: whatever damage leads to.
+    """
+    channels, types, count = dict[int, McapChannel](), dict[int, ProtobufType](), 0
+    for kind, content in _read_records(file):
+        if kind == SCHEMA:
+            types |= _read_protobuf_schemas(content)
+        elif kind == CHANNEL:
+            number, channel = _read_channel(content, types)
+            channels[number] = channel
+            if channel.encoding not in (JSON, PROTOBUF) and sources is not None and sources.of(channel.topic):
+                expected = "messages in JSON or Protobuf with its schema, as others of this file are"
+                raise fail(f"{path}, {channel.topic}", expected, channel.encoding or "no encoding")
+        elif kind == MESSAGE:
+            count += 1
+            number, _, logged, _ = HEADER.unpack_from(content)
+            yield _StoredMessage(count, channels[number], logged, content[HEADER.size :], types)
+
+
+def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufType], data: bytes) -> object:
+    """Return a message: in JSON its text, in Protocol Buffers its fields, in others None.
+
+    Why it is none is returned too, not raised: the reader counts it.
+    """
+    if channel.encoding == JSON:
+        return data.decode(errors="replace")
+    if channel.encoding != PROTOBUF:
+        return None
+    name, schema = types[channel.schema]
+    try:
+        return schema.decode(data, name)
+    except (ValueError, IndexError, struct.error) as error:
+        return fail(f"{where}, {channel.topic}", f"a message of {name}", error)
+
+
+def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
+    """Return the number of a schema of Protocol Buffers with its types; nothing of another, or of one that is none."""
+    name, at = _read_sized_text(content, NUMBER.size)
+    encoding, at = _read_sized_text(content, at)
+    if encoding != PROTOBUF:
+        return {}
+    try:
+        return {NUMBER.unpack_from(content)[0]: ProtobufType(name, ProtobufSchema.of(content[at + LENGTH.size :]))}
+    except (ValueError, KeyError):
+        return {}
+
+
+def _find_channels(file: BinaryIO) -> list[McapChannel]:
+    """Return the channels of the summary of an MCAP file; without one, those that stand before the first message."""
+    # The footer says where the summary begins.
+    file.seek(-END.size - len(MAGIC), os.SEEK_END)
+    kind, _, summary, _, _ = END.unpack(file.read(END.size))
+    if kind == FOOTER and summary and file.read() == MAGIC:
+        file.seek(summary)
+        if found := _list_channels(_read_records(file)):
+            return found
+    # Without it channels stand where they are first used.
+    file.seek(len(MAGIC))
+    return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
+
+
+def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
+    """Return the channels among records, each behind its schema."""
+    channels, types = list[McapChannel](), dict[int, ProtobufType]()
+    for kind, content in records:
+        if kind == SCHEMA:
+            types |= _read_protobuf_schemas(content)
+        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []
+    return channels
+
+
+def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of each record up to the end of the data or the summary; records of chunks by themselves.
+
+    Raises:
+        BagDamagedError: a record that is longer than what is left.
+        Exception: whatever else damage leads to.
+    """
+    from rosbags.rosbag2.storage_mcap import decompress
+
+    while head := file.read(RECORD.size):
+        kind, size = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+        if kind in (DATA_END, FOOTER):
+            return
+        content = file.read(size)
+        if len(head) < RECORD.size or len(content) < size:
+            raise BagDamagedError(
+                str(fail(str(getattr(file, "name", "a chunk")), "whole records", "one that was cut off"))
+            )
+        if kind != CHUNK:
+            yield kind, content
+            continue
+        _, _, whole, checksum = PART.unpack_from(content)
+        compression, at = _read_sized_text(content, PART.size)
+        (packed,) = SIZE.unpack_from(content, at)
+        data = content[at + SIZE.size : at + SIZE.size + packed]
+        yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
+
+
+def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
+    """Return the number of a channel, and its topic, encoding and schema, of which the types are known."""
+    topic, at = _read_sized_text(content, 2 * NUMBER.size)
+    encoding, _ = _read_sized_text(content, at)
+    (schema,) = NUMBER.unpack_from(content, NUMBER.size)
+    encoding = BARE if encoding == PROTOBUF and schema not in types else encoding
+    return NUMBER.unpack_from(content)[0], McapChannel(topic, encoding, schema)
+
+
+def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:
+    """Return the text at a place, where its length stands before it, and the place where it ends."""
+    (size,) = LENGTH.unpack_from(content, at)
+    begin = at + LENGTH.size
+    return content[begin : begin + size].decode(), begin + size

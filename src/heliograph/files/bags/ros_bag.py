@@ -1,0 +1,346 @@
+"""Bags of ROS: MCAP and SQLite files, folders of them, and bags of ROS 1, read by the sources of a network."""
+
+import os
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
+from heliograph.files.bags.mcap_chunks import read_messages_in_order
+from heliograph.files.event_table import EventTable
+from heliograph.files.sources.node_reading import Unread
+from heliograph.files.sources.sources import Sources
+from heliograph.numerics.check import InputError, error_text, fail
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+BAGS = (".mcap", ".db3", ".bag")
+OFTEN = 5000  # messages that are decoded at once, and between two reports of progress
+LARGE = 1 << 22  # bytes that are decoded at once
+LISTED = 8  # topics in one line
+Progress = Callable[[int, int], None]
+MAGIC = b"\x89MCAP0\r\n"  # how MCAP begins and ends
+DATA_END, FOOTER = 0x0F, 0x02  # records of MCAP that follow the data
+# An end of data without a checksum, and a footer without a summary: all is then found by reading on.
+ENDING = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
+BLOCK = 1 << 20  # bytes copied at once
+
+
+class BagDamagedError(InputError):
+    """A bag cannot be read beyond a place."""
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is that of a bag: a file that ends in .mcap, .db3 or .bag, or a folder of these."""
+    return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file() or bool(parts_of(path))
+
+
+def parts_of(path: Path) -> list[Path]:
+    """Return the bag files in a folder in the order of their names; [] where it is one bag of ROS 2, or no folder.
+
+    A bag of ROS 2 is a folder with the file metadata.yaml.
+    """
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return []
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS)
+
+
+def read_bag(
+    path: Path, sources: Sources, events: EventTable, progress: Progress | None = None, strict: bool = False
+) -> None:
+    """Append the events of a network in a bag to a table; only the topics of the sources are decoded.
+
+    A message that cannot be read is refused alone. If the bag ends in the middle, or a topic changes its type, what
+    came before stays, and `broken` of the table says where it ended and why.
+
+    Args:
+        path: the bag.
+        sources: the sources.
+        events: the table.
+        progress: called with the numbers of messages read and to be read.
+        strict: whether the first message that cannot be read is an error.
+
+    Raises:
+        ValueError: no bag, fields that are not in it, or no topic of the sources; one line.
+        ModuleNotFoundError: rosbags is not installed (extra "bags").
+    """
+    with open_bag(path) as (reader, cut_off):
+        events.broken = cut_off
+        counts = Counter[str]()  # messages by topic
+        for connection in reader.connections:
+            counts[connection.topic] += connection.msgcount
+        if cut_off and not counts:
+            raise fail(str(path), "a bag with messages", "one that was cut off before its first part was whole")
+        used = [topic for topic in counts if sources.of(topic)]
+        if not used:
+            expected = f"a topic of the sources, {_join_names(sources.topics)}"
+            raise fail(f"{path}", expected, f"only {_join_names(counts)}")
+        _check_fields_of_sources(path, reader, sources)
+        # Messages become events, many at once where all of them can.
+        total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
+        try:
+            for batch in group_into_batches(read_raw_messages(path, reader, used)):
+                if not decoder.append_events(batch, events):
+                    _append_messages(path, reader, sources, batch, done, events, strict)
+                done += len(batch)
+                if progress is not None:
+                    progress(done, total)
+        except BagDamagedError as error:
+            if strict:
+                raise
+            events.broken = f"{error}; what was read before it stays"
+    _note_unmatched_topics(path, sources, counts, events)
+
+
+def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
+    """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
+
+    `counts`: messages of the bag by topic.
+    """
+    others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
+    if others:
+        events.notes.append(f"{path}: not among the sources: {_format_topic_counts(others)}")
+    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in counts]
+    if missing:
+        events.notes.append(f"{path}: not in the bag: {_join_names(missing)}")
+
+
+@contextmanager
+def open_bag(path: Path) -> "Iterator[tuple[AnyReader, str]]":
+    """Open a bag and yield its reader, and a line that says where it was cut off, "" if it was not.
+
+    Of an MCAP file that was cut off the reader has what is whole.
+
+    Raises:
+        ValueError: no bag, or one that cannot be opened; one line that names it.
+    """
+    if not path.exists():
+        raise fail(str(path), "a bag", "nothing of that name")
+    with ExitStack() as stack:
+        readable, cut_off = path, ""
+        if path.suffix.lower() == ".mcap" and is_mcap_cut_off(path):
+            readable, end = stack.enter_context(make_copy_of_whole_records(path))
+            got = f"one that was cut off after {end:,} bytes of whole records"
+            cut_off = str(fail(str(path), "a bag that ends", f"{got}; what was read before it stays"))
+        yield stack.enter_context(_open_reader(path, readable)), cut_off
+
+
+@contextmanager
+def _open_reader(path: Path, readable: Path) -> "Iterator[AnyReader]":
+    """Open a bag and yield its reader, which is closed at the end; one line if it cannot be opened."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        # Types of ROS itself, for bags of releases that did not write them into the bag.
+        reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    except Exception as error:  # whatever a damaged file makes a reader do
+        raise fail(str(path), "a bag that can be opened", _format_reason(error)) from None
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Iterator[RawMessage]:
+    """Yield the messages of topics in the order in which they were logged.
+
+    Args:
+        path: the bag, for errors.
+        reader: its reader.
+        topics: names of the topics.
+
+    Raises:
+        BagDamagedError: damage, a topic that changes its type; one line with the place.
+    """
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    messages = read_messages_in_order(reader, connections) if connections else iter(())
+    types = dict[str, str]()  # of each topic the type of its first message, which all others have to have
+    count, last_logged = 0, 0
+    while True:
+        try:
+            message = next(messages)
+        except StopIteration:
+            return
+        except Exception as error:  # whatever damage makes a reader do
+            place = "before any message"
+            if count:
+                place = f"after message {count} of its topics, logged at {format_moment(last_logged)}"
+            raise BagDamagedError(
+                str(fail(f"{path}, {place}", "a bag without damage", _format_reason(error)))
+            ) from None
+        topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
+        if types.setdefault(topic, kind) != kind:
+            where = f"{path}, {topic}, logged at {format_moment(last_logged)}"
+            raise BagDamagedError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
+        yield message
+        count += 1
+
+
+def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+    """Yield messages in lists of bounded size; an error comes after what was read before it."""
+    batch, size, failure = list[RawMessage](), 0, None
+    # Up to so many messages or bytes, or to the end.
+    while failure is None:
+        try:
+            message = next(messages, None)
+        except InputError as error:
+            message, failure = None, error
+        if message is not None:
+            batch.append(message)
+            size += len(message.data)
+        if batch and (message is None or len(batch) >= OFTEN or size >= LARGE):
+            yield batch
+            batch, size = [], 0
+        if message is None:
+            break
+    if failure is not None:
+        raise failure
+
+
+def _append_messages(
+    path: Path,
+    reader: "AnyReader",
+    sources: Sources,
+    batch: list[RawMessage],
+    done: int,
+    table: EventTable,
+    strict: bool,
+) -> None:
+    """Append the events of messages one after another; what cannot be read is refused alone.
+
+    Args:
+        path: the bag, for errors.
+        reader: its reader.
+        sources: the sources.
+        batch: the messages.
+        done: how many messages of the sources' topics were read before.
+        table: where the events go.
+        strict: whether the first message that cannot be read is an error.
+    """
+    for number, (connection, logged, data) in enumerate(batch, done + 1):
+        topic, kind = connection.topic, connection.msgtype
+        try:
+            content = reader.deserialize(data, kind)
+        except Exception as error:
+            where = f"{path}, {topic}, logged at {format_moment(logged)}"
+            table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
+            continue
+        for reading in sources.read(topic, content, topic):
+            if isinstance(reading, Unread):
+                where = f"{path}, message {number}, logged at {format_moment(logged)}"
+                table.refuse(InputError(f"{where}, {reading.error}"), strict)
+                table.note_unread(reading, logged)
+            else:
+                table.add(reading, logged)
+
+
+def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
+    """Yield dotted path and basic type of the fields of a message type; lists and what is in them are left out.
+
+    A type that the bag does not define has no fields.
+    """
+    from rosbags.interfaces import Nodetype
+
+    _, fields = reader.typestore.fielddefs.get(kind, ([], []))
+    for name, (node, of) in fields if depth else ():
+        if node == Nodetype.BASE:
+            yield prefix + name, str(of[0])
+        elif node == Nodetype.NAME:
+            yield from list_fields(reader, str(of), f"{prefix}{name}.", depth - 1)
+        else:
+            yield prefix + name, "list"
+
+
+def format_moment(nanoseconds: int) -> str:
+    """Return nanoseconds since 1970 as a date of ISO 8601."""
+    return f"{np.datetime64(nanoseconds, 'ns')}Z"
+
+
+def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) -> None:
+    """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
+    for connection in reader.connections:
+        fields = dict(list_fields(reader, connection.msgtype))
+        needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
+        if needed and not fields:
+            what = f"{path}, {connection.topic}"
+            raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
+        for path_ in needed:
+            if not _has_field(fields, path_):
+                raise fail(
+                    f"{path}, {connection.topic}",
+                    f"a field {path_!r} in {connection.msgtype}",
+                    f"only {_join_names(list(fields), 24)}",
+                )
+
+
+def _has_field(fields: dict[str, str], path: str) -> bool:
+    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list."""
+    lists = [name for name, kind in fields.items() if kind == "list"]
+    return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
+        path.startswith(f"{name}.") for name in lists
+    )
+
+
+def _format_reason(error: Exception) -> str:
+    """Return why something cannot be read, on one line without a full stop."""
+    return " ".join(error_text(error).split()).rstrip(".")
+
+
+def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
+    """Return the first `most` names, and how many more there are."""
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _format_topic_counts(counts: dict[str, int]) -> str:
+    """Return topics, each with its count in brackets."""
+    return _join_names([f"{topic} ({count})" for topic, count in counts.items()])
+
+
+def is_mcap_cut_off(path: Path) -> bool:
+    """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
+    if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
+        return False
+    with path.open("rb") as file:
+        begins = file.read(len(MAGIC)) == MAGIC
+        file.seek(-len(MAGIC), os.SEEK_END)
+        return begins and file.read() != MAGIC
+
+
+def find_end_of_whole_records(path: Path) -> int:
+    """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
+    size, end = path.stat().st_size, len(MAGIC)
+    # A record: a byte for its kind, eight for the length of its content, and this.
+    head = struct.Struct("<BQ")
+    with path.open("rb") as file:
+        while end + head.size <= size:
+            file.seek(end)
+            kind, length = head.unpack(file.read(head.size))
+            if kind in (DATA_END, FOOTER) or end + head.size + length > size:
+                break
+            end += head.size + length
+    return end
+
+
+@contextmanager
+def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
+    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it."""
+    end = find_end_of_whole_records(path)
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        with path.open("rb") as file, copy.open("wb") as whole:
+            left = end
+            while left and (block := file.read(min(BLOCK, left))):
+                whole.write(block)
+                left -= len(block)
+            whole.write(ENDING)
+        yield copy, end

@@ -1,0 +1,166 @@
+"""Availability of devices: the last word, online or offline, that came on a topic beside that of their values."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from typing_extensions import TypeAliasType
+
+from heliograph.files.sources.message_fields import decode_json, field_at, match_topic
+from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.module import readable
+
+Words = TypeAliasType("Words", str | Sequence[str])
+
+
+@readable
+@dataclass(frozen=True)
+class Available:
+    """Condition on a source: the last word of its device on another topic is not offline.
+
+    MQTT devices publish the word, stored by the broker for new subscribers, and leave it to the broker as their last
+    will. The payload is the word itself, or an object of JSON that has it. Before the first word, and after an empty
+    one, a device counts as online.
+
+    Args:
+        topic: topic of the word; + stands for what the topic of the values has at that level, so that
+            "zigbee2mqtt/+/availability" is of the device of "zigbee2mqtt/garden" what "zigbee2mqtt/garden/availability"
+            says.
+        online: the word, or several, in letters of either case (default "online" and "true").
+        offline: the word, or several (default "offline" and "false").
+        path: dotted path of the word in a payload that is an object (default "state").
+
+    Raises:
+        ValueError: no topic, or one with #; words that are no text, or the same for both.
+    """
+
+    topic: str
+    online: Words = ("online", "true")
+    offline: Words = ("offline", "false")
+    path: str = "state"
+
+    def __post_init__(self) -> None:
+        """Check the fields, and keep words as tuples in lower case."""
+        if not isinstance(self.topic, str) or not self.topic or "#" in self.topic:
+            raise fail(
+                "Available, topic", "a topic, with + for what that of the values has there", show_value(self.topic)
+            )
+        if not isinstance(self.path, str):
+            raise fail("Available, path", "a dotted path", show_value(self.path))
+        for name in ("online", "offline"):
+            words = getattr(self, name)
+            several = (words,) if isinstance(words, str) else words
+            if not isinstance(several, Sequence) or not several or not all(isinstance(w, str) and w for w in several):
+                raise fail(f"Available, {name}", "a word, or a list of words", show_value(words))
+            object.__setattr__(self, name, tuple(word.casefold() for word in several))
+        if both := sorted(set(self.online) & set(self.offline)):
+            raise fail("Available, offline", "other words than online", both[0])
+
+    def of(self, topic: str) -> str:
+        """Return the topic on which the device of a topic of values says its word."""
+        levels, values = self.topic.split("/"), topic.split("/")
+        if "+" in levels[len(values) :]:
+            raise fail(f"Available, topic {self.topic!r}", f"+ at levels that {topic!r} has", "more levels")
+        return "/".join(values[i] if level == "+" else level for i, level in enumerate(levels))
+
+    def says_offline(self, payload: object, where: str) -> bool:
+        """Return whether a payload says offline.
+
+        Raises:
+            ValueError: a word that is neither; one line.
+        """
+        word = str(field_at(payload, self.path, where) if isinstance(payload, dict) else payload).strip().casefold()
+        if word not in (*self.online, *self.offline):
+            raise fail(where, f"one of {', '.join((*self.online, *self.offline))}", show_value(payload))
+        return word in self.offline
+
+
+class DeviceStatuses:
+    """Keeps the last word, online or offline, of each device that a condition is about.
+
+    Args:
+        conditions: the conditions.
+    """
+
+    def __init__(self, conditions: Iterable[Available]):
+        """Begin with no word of any device; `conditions`: of sources, on the topics where devices say them."""
+        self._by_pattern: dict[str, list[Available]] = {}
+        for condition in dict.fromkeys(conditions):
+            self._by_pattern.setdefault(condition.topic, []).append(condition)
+        self._offline = set[tuple[Available, str]]()
+        self._heard, self._changed = set[Available](), set[str]()
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the topics on which words are said, wildcards included."""
+        return list(self._by_pattern)
+
+    @property
+    def unheard_topics(self) -> list[str]:
+        """Return the topics, wildcards included, on which no device has said a word."""
+        return [topic for topic, several in self._by_pattern.items() if not self._heard.intersection(several)]
+
+    def find_conditions(self, topic: str) -> list[Available]:
+        """Return the conditions for which a message of this topic is a device's word."""
+        matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
+        return [condition for several in matching for condition in several]
+
+    def take_status_message(self, topic: str, payload: object, where: str) -> bool:
+        """Note the last word of a device if a message is one; return whether it is.
+
+        Args:
+            topic: the topic of the message.
+            payload: its payload, as text or decoded.
+            where: place of the message, for errors.
+
+        Raises:
+            ValueError: a word that is neither online nor offline; one line.
+        """
+        conditions = self.find_conditions(topic)
+        if not conditions:
+            return False
+        said, before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
+        for condition in conditions:
+            self._note_word(condition, topic, offline=said != "" and condition.says_offline(said, where))
+        if self._encode_words_as_bits(topic) != before:
+            self._changed.add(topic)
+        return True
+
+    def pop_changed_words(self) -> dict[str, int]:
+        """Return {topic: its words as a number, as `restore` takes it} of the words changed since the last call."""
+        changed, self._changed = self._changed, set()
+        return {topic: self._encode_words_as_bits(topic) for topic in changed}
+
+    def restore(self, words: Mapping[str, int]) -> None:
+        """Take last words that were kept: of each topic its words as a number, as `pop_changed_words` gives them."""
+        for topic, bits in words.items():
+            for i, condition in enumerate(self.find_conditions(topic)):
+                self._note_word(condition, topic, offline=bool((bits >> i) & 1))
+
+    def _note_word(self, condition: Available, topic: str, offline: bool) -> None:
+        """Note the word of a topic for a condition."""
+        self._heard.add(condition)
+        if offline:
+            self._offline.add((condition, topic))
+        else:
+            self._offline.discard((condition, topic))
+
+    def _encode_words_as_bits(self, topic: str) -> int:
+        """Return the words of a topic as a number: bit i is 1 if its i-th condition says offline."""
+        conditions = self.find_conditions(topic)
+        return sum(1 << i for i, condition in enumerate(conditions) if (condition, topic) in self._offline)
+
+    def is_offline(self, condition: Available, topic: str) -> bool:
+        """Return whether the device of a topic of values has said that it is offline."""
+        return bool(self._offline) and (condition, condition.of(topic)) in self._offline
+
+
+def _decode_payload(payload: object, where: str) -> object:
+    """Return what a payload says: JSON, or the text itself."""
+    if isinstance(payload, bytes):
+        payload = payload.decode(errors="replace")
+    if not isinstance(payload, str):
+        return payload
+    try:
+        return decode_json(payload, where)
+    except InputError:
+        return payload.strip()

@@ -1,0 +1,257 @@
+"""Frames of a CAN bus, of BLF, ASC and MDF4, to messages with the signals that a database describes."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.logs.vehicle_log import DIGITS, Log, Wanted
+from heliograph.files.messages.message_files import FileMessage
+from heliograph.files.text.text_file import CutOffError
+from heliograph.numerics.check import InputError, error_text, fail
+
+if TYPE_CHECKING:
+    from can import Message
+    from can.io.generic import MessageReader
+    from cantools.database.can import Message as Description
+
+LISTED = 8  # identifiers in one line
+Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether it has 29 bits
+
+
+def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Open a log of frames; without a database its messages are named by their identifiers and have no signals.
+
+    Raises:
+        ValueError: no database, or one that cannot be read.
+        ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
+    """
+    database = {} if sources.dbc is None else read_can_database(sources.dbc)
+    notes = list[str]()
+    units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
+    kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
+    bits = {m.name: {s.name: s.length for s in m.signals if s.scale == 1 and not s.unit} for m in database.values()}
+    return Log(units, kinds, FrameReader(path, sources, database, wanted, notes).read_messages(), notes, bits)
+
+
+def read_can_database(path: Path) -> Database:
+    """Return the messages of a database of a bus by their identifiers.
+
+    Raises:
+        ValueError: no such file, or no database of a CAN bus; one line.
+    """
+    from cantools import database
+    from cantools.database.can import Database as CanDatabase
+
+    if not path.is_file():
+        raise fail(str(path), "a database of a CAN bus", "a folder" if path.is_dir() else "nothing of that name")
+    try:
+        # Signals of real databases overlap.
+        loaded: Any = database.load_file(path, strict=False)
+    except Exception as error:  # whatever a damaged file makes a parser do
+        raise fail(str(path), "a database of a CAN bus", error_text(error)) from None
+    if not isinstance(loaded, CanDatabase):
+        raise fail(str(path), "a database of a CAN bus", "one of diagnostics")
+    return {(m.frame_id, m.is_extended_frame): m for m in loaded.messages if not m.is_container}
+
+
+class FrameReader:
+    """Reads frames as messages, and counts what is left out.
+
+    Args:
+        path: the log.
+        sources: the bus's channel, the date of the begin, and the name of the database.
+        database: messages by identifier.
+        wanted: whether a message of a name is decoded.
+        notes: lines on what was left out, appended at the end.
+    """
+
+    def __init__(self, path: Path, sources: LogSources, database: Database, wanted: Wanted, notes: list[str]):
+        """Prepare to read a log of frames by a database of its messages; `notes` gets lines on what was left out."""
+        self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
+        # By name of the message: frames decoded, frames longer than described, sizes of those too short, channels.
+        self._decoded, self._longer = Counter[str](), Counter[str]()
+        self._short: dict[str, Counter[int]] = defaultdict(Counter)
+        self._channels: dict[str, set[object]] = defaultdict(set)
+        # Frames by identifier, and frames left out by kind.
+        self._identifiers, self._left_out = Counter[str](), Counter[str]()
+
+    def read_messages(self) -> Iterator[FileMessage | InputError]:
+        """Yield the messages in the order of the file, or why one cannot be read; then note what was left out.
+
+        Raises:
+            ValueError: no frame of a wanted message, frames all of which are too short for it, or of two buses.
+        """
+        for number, item in enumerate(_read_frames(self._path, self._sources), 1):
+            if isinstance(item, InputError):
+                yield item
+                continue
+            frame, moment = item
+            if frame.is_error_frame or frame.is_remote_frame:
+                self._left_out["error" if frame.is_error_frame else "remote"] += 1
+            elif self._sources.channel in (None, frame.channel):
+                message = self._decode_frame(frame, moment, f"{self._path}, frame {number}")
+                if message is not None:
+                    yield message
+            else:
+                self._left_out[f"of channel {frame.channel}"] += 1
+        self._check_frames_fit_database()
+        self._note_left_out()
+
+    def _note_left_out(self) -> None:
+        """Append a line on the frames that were left out, and one on those longer than the database has them."""
+        if self._left_out:
+            counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
+            self._notes.append(f"{self._path}: frames left out: {counts}")
+        if self._longer:
+            counts = ", ".join(f"{name} ({count})" for name, count in self._longer.items())
+            self._notes.append(f"{self._path}: frames longer than {self._sources.dbc} has them: {counts}")
+
+    def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
+        """Return the message of a frame, or why it cannot be read; None of one that is not wanted.
+
+        Args:
+            frame: the frame.
+            moment: its time in seconds since 1970.
+            where: place of the frame, for errors.
+        """
+        description = self._database.get((frame.arbitration_id, frame.is_extended_id))
+        name = f"0x{frame.arbitration_id:x}" if description is None else description.name
+        self._identifiers[f"0x{frame.arbitration_id:x}"] += 1
+        if not self._wanted(name):
+            return None
+        signals: dict[str, Any] | InputError = {}
+        if description is not None:
+            self._check_channel(name, frame.channel)
+            where = f"{where}, {name}"
+            signals = self._decode_signals(frame, description, where)
+        if isinstance(signals, InputError):
+            return signals
+        self._decoded[name] += 1
+        return FileMessage(where, name, {STAMP: moment, **signals}, moment)
+
+    def _decode_signals(self, frame: "Message", description: "Description", where: str) -> dict[str, Any] | InputError:
+        """Return the signals of a frame by name, None for one that it does not have; or why they cannot be read.
+
+        `description`: the frame's message as the database has it. Frames of other lengths are counted.
+        """
+        size, length = len(frame.data), description.length
+        if size < length:
+            self._short[description.name][size] += 1
+            return fail(where, f"{length} bytes, as {self._sources.dbc} has it", f"{size}")
+        try:
+            decoded: Any = description.decode(bytes(frame.data), decode_choices=False)
+        except Exception as error:  # a multiplexer that the database does not know
+            return fail(where, f"what {self._sources.dbc} describes", error_text(error))
+        if size > length:
+            self._longer[description.name] += 1
+        # Signals that a multiplexed message does not have this time did not arrive.
+        signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
+        return signals
+
+    def _check_channel(self, name: str, channel: object) -> None:
+        """Raise ValueError where a message comes from two buses."""
+        seen = self._channels[name]
+        seen.add(channel)
+        if len(seen) > 1:
+            raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
+
+    def _check_frames_fit_database(self) -> None:
+        """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one."""
+        remedy = "another database, or another bus (channel=)?"
+        for name, sizes in self._short.items():
+            if not self._decoded[name]:
+                length = next(m.length for m in self._database.values() if m.name == name)
+                got = f"{sizes.total()} of {', '.join(map(str, sorted(sizes)))}; {remedy}"
+                raise fail(f"{self._path}, {name}", f"frames of {length} bytes, as {self._sources.dbc} has it", got)
+        wanted = [f"{m.name} (0x{m.frame_id:x})" for m in self._database.values() if self._wanted(m.name)]
+        if wanted and not self._decoded:
+            among = f"only {_join_names(list(self._identifiers))}; {remedy}" if self._identifiers else "no frame at all"
+            if self._sources.channel is not None and not self._identifiers:
+                among = ", ".join(f"frames {kind}" for kind in self._left_out) or among
+            raise fail(str(self._path), f"a frame of {_join_names(wanted)}", among)
+
+
+def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
+    """Yield frames with their moments in seconds since 1970; where the file is damaged the last is an error."""
+    count = 0
+    with ExitStack() as stack:
+        try:
+            opened = _open_frame_reader(path, stack)
+        except (InputError, ModuleNotFoundError):
+            raise
+        except Exception as error:  # whatever a damaged file makes a reader do
+            raise fail(str(path), "a log of a CAN bus", error_text(error)) from None
+        # Seconds from the file's times to those since 1970; the sources may say when the log began.
+        shift = opened.shift if sources.start is None else sources.start - opened.begin
+        frames = iter(opened.reader)
+        while True:
+            try:
+                frame = next(frames, None)
+            except Exception as error:  # whatever a damaged file makes a reader do
+                yield CutOffError(str(fail(f"{path}, after frame {count}", "a log without damage", error_text(error))))
+                return
+            if frame is None:  # the end
+                return
+            count += 1
+            yield frame, round(frame.timestamp + shift, DIGITS)
+
+
+class _OpenedFrames(NamedTuple):
+    """A reader of frames; the time of the log's begin by it, and what added to its times makes seconds since 1970."""
+
+    reader: "MessageReader"
+    begin: float
+    shift: float
+
+
+def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
+    """Open a log of frames by the kind of its name: BLF, ASC, or else MDF4; the stack closes it.
+
+    Raises:
+        ValueError: an ASC log whose times are from each event to the next.
+    """
+    kind = path.suffix.lower()
+    if kind == ".blf":
+        from can import BLFReader
+
+        blf = BLFReader(path)
+        stack.callback(blf.stop)
+        return _OpenedFrames(blf, begin=blf.start_timestamp, shift=0.0)
+    if kind == ".asc":
+        return _open_asc(path, stack)
+    import asammdf
+    from can.io.mf4 import MF4Reader
+
+    with asammdf.MDF(path) as file:
+        begin = file.start_time.timestamp()
+    return _OpenedFrames(stack.enter_context(MF4Reader(path)), begin=begin, shift=0.0)
+
+
+def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
+    """Open an ASC log, whose frames have seconds from the begin; the stack closes it.
+
+    The date of the begin has no zone: it is read as UTC, on every machine.
+
+    Raises:
+        ValueError: times from each event to the next.
+    """
+    from can import ASCReader
+
+    # A first reader, for the header alone.
+    header = ASCReader(path, relative_timestamp=False)
+    stack.callback(header.stop)
+    next(iter(header), None)
+    if header.timestamps_format == "relative":
+        expected = "times from the log's begin ('timestamps absolute' in its header)"
+        raise fail(str(path), expected, "times from each event to the next")
+    begin = datetime.fromtimestamp(header.start_time).replace(tzinfo=UTC).timestamp() if header.start_time else 0.0
+    return _OpenedFrames(stack.enter_context(ASCReader(path)), begin=0.0, shift=begin)
+
+
+def _join_names(names: list[str]) -> str:
+    """Return the first LISTED names, and how many more there are."""
+    return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")

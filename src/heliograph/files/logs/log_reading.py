@@ -1,0 +1,135 @@
+"""Messages of a vehicle's log for the sources of a network, checked against the signals that the log has."""
+
+from collections.abc import Iterator
+from difflib import get_close_matches
+from pathlib import Path
+
+from heliograph.files.logs.can_frames_to_messages import open_frame_log
+from heliograph.files.logs.log_sources import STAMP, LogSources
+from heliograph.files.logs.mdf import open_mdf
+from heliograph.files.logs.ulog import open_ulog
+from heliograph.files.logs.vehicle_log import MDF, ULOG, Log, Wanted, list_logs
+from heliograph.files.messages.message_files import FileMessage
+from heliograph.files.sources.sources import Sources
+from heliograph.numerics.check import InputError, fail
+
+LISTED = 8  # names in one line
+OR = " or "  # between units of a signal that differ from log to log
+
+
+def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Return a vehicle's log, or those in a folder as one, file by file; only messages that are wanted are decoded.
+
+    Args:
+        path: the log, or the folder.
+        sources: which database and which channel of a bus, and when the log began.
+        wanted: whether a message of a name is decoded.
+
+    Raises:
+        ValueError: what `open_log` refuses.
+        ModuleNotFoundError: what reads one is not installed.
+    """
+    logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
+    if len(logs) == 1:
+        return logs[0]
+    # Notes come with the messages: once all of a log have been read.
+    notes = list[str]()
+
+    def read_one_after_another() -> Iterator[FileMessage | InputError]:
+        """Yield the messages of all logs, and collect their notes."""
+        for log in logs:
+            yield from log.messages
+            notes.extend(log.notes)
+
+    # By topic the units and bits of the signals that any of the logs has; units that differ stand side by side.
+    units, bits = dict[str, dict[str, str]](), dict[str, dict[str, int]]()
+    for log in logs:
+        for topic, signals in log.units.items():
+            known = units.setdefault(topic, {})
+            for name, unit in signals.items():
+                several = dict.fromkeys([*known.get(name, "").split(OR), unit])
+                known[name] = OR.join(one for one in several if one)
+        for topic, widths in log.bits.items():
+            bits[topic] = {**bits.get(topic, {}), **widths}
+    kinds = {topic: kind for log in logs for topic, kind in log.kinds.items()}
+    return Log(units, kinds, read_one_after_another(), notes, bits)
+
+
+def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
+    """Return a vehicle's log, opened by the kind of its name; only messages that are wanted are decoded.
+
+    Raises:
+        ValueError: no such file, one that cannot be opened, frames without a database; one line.
+        ModuleNotFoundError: what reads it is not installed (extra "can", "mdf" or "ulog").
+    """
+    if not path.is_file():
+        raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
+    kind = path.suffix.lower()
+    if kind in ULOG:
+        return open_ulog(path, sources, wanted)
+    if kind in MDF and sources.dbc is None:
+        return open_mdf(path, sources, wanted)
+    return open_frame_log(path, sources, wanted)
+
+
+def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
+
+    Of several logs in a folder those of one file after another; each message has to be in one of them.
+
+    Args:
+        path: the log, or the folder.
+        table: the sources as the network's file has them, a `LogSources` or a dictionary.
+        sources: the same, checked against the network.
+        notes: lines on units and on what was left out, which are appended.
+
+    Raises:
+        ValueError: no such log, no database, a message or a signal that is not there, or whose unit differs from log
+            to log; one line with the remedy.
+    """
+    given = table if isinstance(table, LogSources) else LogSources({})
+    log = open_logs(path, given, lambda name: bool(sources.of(name)))
+    place = str(path) if given.dbc is None else f"{path} by {given.dbc}"
+    used = _find_signal_units(place, path, log, sources)
+    yield from log.messages
+    notes += log.notes
+    if path.is_dir():
+        rest = [part.name for part in sorted(path.iterdir()) if part not in list_logs(path) and part != given.dbc]
+        notes += [f"{path}: not read beside logs: {', '.join(rest[:LISTED])}"] if rest else []
+    if used:
+        notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
+
+
+def _find_signal_units(place: str, path: Path, log: Log, sources: Sources) -> list[str]:
+    """Return the units of the signals of sources.
+
+    Raises:
+        ValueError: a message or a signal that is not in the log, a signal of another unit in another log.
+    """
+    remedy = f"heliograph inspect {path} lists what there is"
+    for topic in sources.topics:
+        if topic not in log.units and not set("+#") & set(topic):
+            hint = "; dbc= of LogSources names their database" if not log.units else f"; {remedy}"
+            raise fail(place, f"a message {topic!r} of the sources", f"{_suggest_names(topic, log.units)}{hint}")
+    used = dict[str, None]()
+    for topic, signals in log.units.items():
+        for mapped in sources.of(topic):
+            for path_in_message in mapped.source.fields:
+                name = path_in_message if path_in_message in signals else path_in_message.split(".")[0]
+                if name not in signals and name != STAMP:
+                    got = f"{_suggest_names(path_in_message, signals)}; {remedy}"
+                    raise fail(f"{place}, {topic}", f"a signal {path_in_message!r} of the sources", got)
+                if OR in signals.get(name, "") and len(list_logs(path)) > 1:
+                    raise fail(f"{place}, {topic}", f"one unit of {name!r} in all logs", signals[name])
+                if signals.get(name):
+                    used[f"{topic}.{name} in {signals[name]}"] = None
+    return list(used)
+
+
+def _suggest_names(name: str, known: dict[str, object] | dict[str, str] | dict[str, dict[str, str]]) -> str:
+    """Return in words which names there are instead: the closest one, or else the first LISTED."""
+    close = get_close_matches(name, known, 1)
+    if close:
+        return f"none of that name (closest: {close[0]!r})"
+    more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
+    return f"only {', '.join(list(known)[:LISTED])}{more}" if known else "no message with signals"

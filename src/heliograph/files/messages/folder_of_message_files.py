@@ -1,0 +1,75 @@
+"""A folder of files of messages, read as one recording whose topics are the files."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from heliograph.files.bags.ros_bag import is_bag
+from heliograph.files.messages.message_files import LINES, FileMessage, make_default_topic, read_message_file
+from heliograph.files.sources.sources import Sources
+from heliograph.files.text.text_file import find_extension
+from heliograph.numerics.check import InputError, fail
+
+LISTED = 8  # files in one line
+
+
+def is_message_folder(path: Path) -> bool:
+    """Return whether a path is a folder that may have files of messages: one that is no bag."""
+    return path.is_dir() and not is_bag(path)
+
+
+def list_message_files(folder: Path) -> list[Path]:
+    """Return the files of messages in a folder, by name: tables and files of lines, not those in folders within it.
+
+    Raises:
+        ValueError: there is none; one line.
+    """
+    kinds = (*LINES, ".csv", ".parquet")
+    files = sorted(path for path in folder.iterdir() if path.is_file() and find_extension(path) in kinds)
+    if not files:
+        raise fail(str(folder), "a bag, or a folder with tables or files of lines", "a folder with neither")
+    return files
+
+
+def find_topic_of_file(path: Path, sources: Sources) -> str:
+    """Return the topic of a file's messages that name none."""
+    return path.name if sources.of(path.name) else make_default_topic(path)
+
+
+def list_used_files(folder: Path, sources: Sources) -> list[Path]:
+    """Return the files of a folder that are topics of sources."""
+    return [path for path in list_message_files(folder) if sources.of(find_topic_of_file(path, sources))]
+
+
+def read_message_folder(folder: Path, sources: Sources) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of the files that are topics of sources, file by file, or why one cannot be read.
+
+    Raises:
+        ValueError: no file is; a file that cannot be read at all. One line.
+    """
+    files = list_used_files(folder, sources)
+    if not files:
+        got = f"only {_join_names([path.name for path in list_message_files(folder)])}"
+        raise fail(str(folder), f"a file that the sources name, {_join_names(sources.topics)}", got)
+    for path in files:
+        topic = find_topic_of_file(path, sources)
+        for message in read_message_file(path):
+            if isinstance(message, InputError) or message.topic is not None:
+                yield message
+            else:
+                yield message._replace(topic=topic)
+
+
+def describe_unused_files(folder: Path, sources: Sources) -> list[str]:
+    """Return a line on the files that are no topics of sources, and one on the topics that are no files."""
+    used = list_used_files(folder, sources)
+    rest = [path.name for path in list_message_files(folder) if path not in used]
+    found = {find_topic_of_file(path, sources) for path in used}
+    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
+    lines = [f"{folder}: not among the sources: {_join_names(rest)}"] if rest else []
+    return [*lines, f"{folder}: not in the folder: {_join_names(missing)}"] if missing else lines
+
+
+def _join_names(names: list[str]) -> str:
+    """Return the first LISTED names, and how many more there are."""
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return f"{', '.join(names[:LISTED])}{more}"

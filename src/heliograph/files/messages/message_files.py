@@ -1,0 +1,241 @@
+"""Messages in files of tables and of lines: rows of CSV and Parquet, JSON lines, logs of MQTT clients; also packed."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from heliograph.files.sources.message_fields import decode_items, decode_json, fail_of_doubled, parse_number
+from heliograph.files.text.csv_dialects import check_distinct
+from heliograph.files.text.csv_text import CsvRow, read_csv_header, read_csv_rows
+from heliograph.files.text.text_file import find_extension, is_valid_text, open_text, yield_until_cut_off
+from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.times.dates import parse_instant
+
+TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
+ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
+CLOCKS = ("timestamp", "time", "ts")  # the same, where they are dates with a zone or seconds, beside a payload
+YEARS = 1e9, 1e10  # seconds since 1970 of 2001 to 2286
+LINES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
+# A date or seconds, a topic and a payload, as `mosquitto_sub -F "%I %t %p"` and `mosquitto_sub -v` print them.
+LOGGED = re.compile(r"(?:(?P<arrival>\d{4}-\d\d-\d\dT\S+|\d+(?:\.\d+)?) )?(?P<topic>[^\s{}\[\]\",]+) (?P<payload>.*)")
+
+
+class FileMessage(NamedTuple):
+    """Message of a file.
+
+    Attributes:
+        where: its place, for errors.
+        topic: its topic; None for that of its file.
+        content: the message, decoded; its payload as text where it is of a log.
+        arrival: when it arrived, as the file says it; None if it does not.
+        stored: whether the broker had stored it for new subscribers.
+    """
+
+    where: str
+    topic: str | None
+    content: Any
+    arrival: Any
+    stored: bool = False
+
+
+def is_message_file(path: Path) -> bool:
+    """Return whether a file has lines of messages, by its name."""
+    return find_extension(path) in LINES
+
+
+def make_default_topic(path: Path) -> str:
+    """Return the topic of the messages of a file that name none: its name, without .gz."""
+    return path.name.removesuffix(".gz")
+
+
+def table_has_topics(path: Path) -> bool:
+    """Return whether a table is a log of messages: it has a column `topic`."""
+    kind = find_extension(path)
+    if kind == ".parquet" and path.is_file():
+        return TOPIC in read_parquet_names(path)
+    return kind == ".csv" and path.is_file() and TOPIC in read_csv_header(path)
+
+
+def read_parquet_names(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file; none of a file that is none."""
+    import pyarrow.parquet as pq
+
+    try:
+        return list(pq.ParquetFile(path).schema_arrow.names)
+    except (ValueError, OSError):  # no such file: who reads it says so
+        return []
+
+
+def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file, or why one cannot be read, in the order of the file.
+
+    Where the file is damaged or cut off the last is a `CutOffError`.
+
+    Raises:
+        ValueError: the file cannot be read at all; one line.
+    """
+    kind = find_extension(path)
+    if not path.is_file():
+        raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
+    if kind == ".parquet":
+        yield from (make_message_of_row(where, row) for where, row in _read_parquet_rows(path))
+    else:
+        yield from yield_until_cut_off(_read_json_messages(path) if kind in LINES else _read_csv_messages(path))
+
+
+def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
+    """Return topic, payload and arrival of a line that an MQTT client printed; None for any other."""
+    match = LOGGED.fullmatch(text.strip())
+    return None if match is None else (match["topic"], match["payload"], match["arrival"])
+
+
+def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
+    """Return topic, payload, arrival and whether it was stored of a message of a log in JSON; None for any other."""
+    if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
+        return None
+    inner = content[PAYLOAD]
+    text = inner if isinstance(inner, str) else json.dumps(inner)
+    return content[TOPIC], text, find_arrival_time(content), bool(content.get("retain"))
+
+
+def find_arrival_time(logged: Mapping[str, Any]) -> Any:
+    """Return when a message with a payload was logged, as the log says it; None if it does not."""
+    arrivals = [logged[name] for name in ARRIVALS if logged.get(name) is not None]
+    arrivals += [logged[name] for name in CLOCKS if _is_moment(logged.get(name))]
+    return arrivals[0] if arrivals else None
+
+
+def _is_moment(value: object) -> bool:
+    """Return whether a value is a date with a zone, or seconds since 1970 of our centuries."""
+    number = parse_number(value) if isinstance(value, str) else value
+    if isinstance(number, str):
+        try:
+            parse_instant(number)
+        except ValueError:
+            return False
+        return True
+    return isinstance(number, int | float) and YEARS[0] <= number < YEARS[1]
+
+
+def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
+    """Return the message of a row of a table.
+
+    Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
+    """
+    arrival = find_arrival_time(row) if PAYLOAD in row else row.get("arrival")
+    if TOPIC not in row:
+        return FileMessage(where, None, row, arrival)
+    payload = row.get(PAYLOAD, row)
+    return FileMessage(where, str(row[TOPIC]), payload, arrival)
+
+
+def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of a file of JSON, one document or one message a line; an error in place of a bad one."""
+    with open_text(path) as file:
+        if find_extension(path) == ".json":  # one document, of any number of lines, or one a line
+            text = file.read()
+            try:
+                yield from parse_message_document(text, str(path))
+                return
+            except InputError:
+                lines = enumerate(text.splitlines(), 1)
+        else:
+            lines = enumerate(file, 1)
+        for number, line in lines:
+            if line.strip():
+                yield from parse_message_line(f"{path}, line {number}", line)
+
+
+def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
+    """Return the messages of a document of JSON, in lists or lists of lists; an error in place of a bad one.
+
+    Raises:
+        ValueError: no JSON; one line.
+    """
+    return [
+        _make_message_of_json(f"{name}, message {n}", item, doubled)
+        for n, (item, doubled) in enumerate(decode_items(text, name), 1)
+    ]
+
+
+def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
+    """Return the message of a line, those of a list of them, or why it cannot be read."""
+    line = line.strip()
+    if not is_valid_text(line):
+        return [fail(where, "a text in UTF-8", show_value(line))]
+    try:
+        return [_make_message_of_json(where, *item) for item in decode_items(line, where)]
+    except InputError as error:
+        parts = parse_log_line(line)
+        return [error if parts is None else FileMessage(where, *parts)]
+
+
+def _make_message_of_json(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
+    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file.
+
+    An error in place of one that has a field twice.
+    """
+    if doubled is not None:
+        return fail_of_doubled(where, doubled)
+    logged = read_log_entry(content)
+    if logged is None:
+        return FileMessage(where, None, content, content.get("arrival") if isinstance(content, dict) else None)
+    topic, payload, arrival, stored = logged
+    return FileMessage(where, topic, payload, arrival, stored)
+
+
+def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
+    """Yield the messages of the rows of a CSV file, or why one cannot be read."""
+    for row in read_csv_rows(path, marked=True):
+        yield row if isinstance(row, InputError) else make_message_of_row(row.where, convert_cells(row))
+
+
+def convert_cells(row: CsvRow) -> dict[str, Any]:
+    """Return the cells of a row by name: numbers with every digit of whole ones, None of empty cells, else texts.
+
+    A payload stays a text.
+    """
+    results: dict[str, Any] = {}
+    for name, cell in zip(row.header, row.cells, strict=True):
+        if name == PAYLOAD:
+            results[name] = cell
+        else:
+            results[name] = parse_number(cell) if cell else None
+    return results
+
+
+def _read_parquet_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield place and cells of each row, counted from 1; moments are dates of ISO 8601, in UTC if they have no zone."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(path).read()
+    names = table.column_names
+    check_distinct(path, names)
+    for i, column in enumerate(table.columns):
+        if pa.types.is_timestamp(column.type):
+            whole = column.cast(pa.timestamp("ns", "UTC")).cast(pa.int64()).to_pylist()
+            texts = [None if t is None else _format_moment(t) for t in whole]
+            table = table.set_column(i, names[i], pa.chunked_array([pa.array(texts, pa.string())]))
+    for number, row in enumerate(table.to_pylist(), 1):
+        yield f"{path}, row {number}", row
+
+
+def _format_moment(nanoseconds: int) -> str:
+    """Return nanoseconds since 1970 as a date of ISO 8601."""
+    import numpy as np
+
+    return f"{np.datetime64(nanoseconds, 'ns')}Z"
+
+
+def decode_message_content(message: FileMessage) -> object:
+    """Return the content of a message, decoded from JSON where it is the payload of a log.
+
+    Raises:
+        ValueError: no JSON, or a field that is there twice; one line.
+    """
+    if not isinstance(message.content, str):
+        return message.content
+    return decode_json(message.content, f"{message.where}, {PAYLOAD!r}")

@@ -1,0 +1,297 @@
+"""Messages in the format of heliograph itself, in tables and lines: a node, its count, a time, and values."""
+
+from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.event_columns import node_counts_losses
+from heliograph.files.event_table import EventTable
+from heliograph.files.messages.message_files import FileMessage, read_parquet_names
+from heliograph.files.sources.message_fields import convert_name
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.text.csv_dialects import NO_VALUE
+from heliograph.files.text.csv_text import read_csv_header
+from heliograph.files.text.text_file import CutOffError, find_extension
+from heliograph.live.event import INPUTS, OF_STEPS, check_63_bits
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.times.dates import looks_like_date, parse_moment
+from heliograph.simulation.network import Network
+
+EXACT = 2**53  # up to here doubles hold every whole number
+MOST_REASONS = 3  # that are kept of messages that could not be read
+NODE, SEQUENCE, TIME, ARRIVAL, VALUES, PLANT = "node", "sequence", "time", "arrival", "values", "plant"
+NOTHING = np.zeros(0)
+OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
+
+
+def holds_events(path: str | Path) -> bool:
+    """Return whether a CSV or Parquet file has events instead of rows: it has the columns `node` and `sequence`."""
+    path = Path(path)
+    if not path.is_file() or not is_table_file(path):
+        return False
+    return {NODE, SEQUENCE} <= set(
+        read_parquet_names(path) if find_extension(path) == ".parquet" else read_csv_header(path)
+    )
+
+
+def is_table_file(path: Path) -> bool:
+    """Return whether a file has rows, by its name."""
+    return find_extension(path) in (".csv", ".parquet")
+
+
+def is_own_message(content: object) -> bool:
+    """Return whether a decoded message is in our own form."""
+    return isinstance(content, Mapping) and NODE in content and bool({SEQUENCE, VALUES, INPUTS} & content.keys())
+
+
+class OwnMessageCollector:
+    """Collects messages in our own form in a table of their events, and counts those that cannot be read.
+
+    Args:
+        network: the network that the names belong to.
+        source: the file, or what else prints as its name.
+        table: whether it has rows, of which all have the same columns.
+        ignore_unknown: whether columns that nobody knows are left out.
+    """
+
+    def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
+        self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
+        self._table: EventTable | None = None
+        self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
+
+    def add(self, message: FileMessage | InputError, strict: bool) -> None:
+        """Append the events of a message; what cannot be read is refused alone.
+
+        Raises:
+            ValueError: columns that lack, or that nobody knows; where reading is strict, a message that cannot be read.
+        """
+        try:
+            if isinstance(message, InputError):
+                raise message
+            self._add_message(message)
+            self.used += 1
+        except HeaderError:
+            raise
+        except InputError as error:
+            if strict:
+                raise
+            if isinstance(error, CutOffError):
+                self.broken = str(error)
+                return
+            self.refused += 1
+            self.reasons += [str(error)] if len(self.reasons) < MOST_REASONS else []
+
+    def events(self) -> EventTable:
+        """Return the events that were read, with notes on their times and on what was refused.
+
+        Raises:
+            ValueError: none could be read; why the first could not.
+        """
+        if self._table is None:
+            raise InputError(self.reasons[0]) if self.reasons else fail(str(self.source), "at least one row", "none")
+        if self._reader.zero:
+            self._table.notes.append(f"{self.source}: times are counted from {self._reader.zero}")
+        if self._reader.rounded is not None:
+            digits = f"from {self._reader.rounded} on times are rounded to the nearest double"
+            self._table.notes.append(f"{self.source}: {digits}, as the first, counted from, is far from them")
+        self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
+        return self._table
+
+    def _add_message(self, message: FileMessage) -> None:
+        """Add the event of one message to the table, and one of the inputs that it brings."""
+        found = self._reader.read(message.where, message.content)
+        if self._table is None:
+            self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
+        for reading, arrival in found:
+            if isinstance(reading, Unread):
+                self._table.note_unread(reading, arrival)
+                raise reading.error
+            self._table.add(reading, arrival)
+
+
+class OwnMessageReader:
+    """Reader of messages in our own form.
+
+    Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the
+    values: one field for each component, named as the sensor's outputs or the plant's inputs, or `values` with all of
+    the node's numbers, as a list or separated by spaces. What is empty did not arrive. Times are numbers or dates of
+    ISO 8601, all with a time zone or all without. A sequence keeps every digit.
+
+    Args:
+        network: the network that the names belong to.
+        source: where the messages are from, for errors.
+        ignore_unknown: whether fields that nobody knows are left out.
+        table: whether the messages are rows of a table, whose columns all have.
+
+    Attributes:
+        numbers: whether times are numbers, and not dates; None before the first.
+        zero: what whole numbers are counted from that doubles could not tell apart; 0 or None for others.
+        rounded: the first whole number that doubles do not hold, where the first of all was small; None of none.
+    """
+
+    def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
+        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns."""
+        self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
+        self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
+        self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+        self.steps = TIME_STEP not in network.inputs
+        self._numbered = [name for name in network.names if node_counts_losses(network, name)]
+        self.numbers: bool | None = None
+        self.zero: int | None = None
+        self.rounded: int | None = None
+        self._zoned: bool | None = None
+        self._columns: Set[str] = frozenset()
+
+    def read(self, where: str, row: Mapping[str, Any]) -> list[tuple[Reading | Unread, Any]]:
+        """Return the events of a message, its inputs first, each with its arrival, in the unit of times.
+
+        Where its values cannot be read, one `Unread` with node, count and time stands for the events.
+
+        Args:
+            where: place of the message, for errors.
+            row: its fields.
+
+        Raises:
+            HeaderError: columns that lack, or that nobody knows.
+            ValueError: a message that cannot be read; one line.
+        """
+        self._check_columns(where, row)
+        node = row[NODE]
+        if node not in self.components:
+            raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(self.components)}", show_value(node))
+        sequence = _parse_whole_number(row[SEQUENCE], f"{where}, column {SEQUENCE!r}")
+        # Without an arrival it arrived when it was measured. A table has the column or not: an empty cell is an error.
+        time, dated = self._read_time(row[TIME], where, TIME)
+        arrival = time
+        if ARRIVAL in row and (row[ARRIVAL] is not None or self._table):
+            arrival, _ = self._read_time(row[ARRIVAL], where, ARRIVAL)
+        plant = "" if row.get(PLANT) is None else convert_name(row[PLANT], f"{where}, column {PLANT!r}")
+        self.numbers = not dated
+        try:
+            values = _read_event_values(row, self.components[node], where, node in self._numbered)
+        except InputError as error:
+            return [(Unread(error, Reading(plant, node, sequence, time, NOTHING)), arrival)]
+        events: list[tuple[Reading | Unread, Any]] = []
+        # A message of a node may bring the inputs that were set then: an event of their own.
+        if isinstance(row.get(INPUTS), list) and node != INPUTS:
+            inputs = _read_event_values({VALUES: row[INPUTS]}, self.components[INPUTS], where)
+            events.append((Reading(plant, INPUTS, sequence, time, inputs), arrival))
+        return [*events, (Reading(plant, node, sequence, time, values), arrival)]
+
+    def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
+        """Raise ValueError at an unknown column, which is most likely misspelt, or at one that lacks.
+
+        Of rows with the same columns the first is looked at.
+        """
+        if row.keys() == self._columns:
+            return
+        # The columns of a table are those of its header: an error of all of it.
+        place = f"{self.source}, header" if self._table else where
+        error_type = HeaderError if self._table else InputError
+        known = [*OWN, *(name for names in self.components.values() for name in names)]
+        for name in () if self._ignore else row:
+            if name not in known:
+                listed = ", ".join(dict.fromkeys(known))
+                raise error_type(str(fail(place, f"only the columns {listed}", repr(name))))
+        for name in (NODE, SEQUENCE, TIME):
+            if name not in row:
+                raise error_type(str(fail(place, f"a column {name!r}", f"only {', '.join(row)}")))
+        self._columns = row.keys()
+
+    def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
+        """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
+        name = f"{where}, column {column!r}"
+        dated = isinstance(cell, str) and looks_like_date(cell)
+        if self.numbers is not None and dated != (not self.numbers):
+            expected = "a number, as the times before" if dated else "a date, as the times before"
+            raise fail(name, expected, show_value(cell))
+        if not dated:
+            return self._read_number_of_time(cell, name, is_step=self.steps and column == TIME), False
+        if self.steps:
+            raise fail(name, "a step, a whole number from 0", f"{show_value(cell)} ({OF_STEPS})")
+        moment, zoned = parse_moment(cell, name)
+        self._zoned = zoned if self._zoned is None else self._zoned
+        if zoned != self._zoned:
+            raise fail(name, "a zone with every date or with none", show_value(cell))
+        return moment, True
+
+    def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
+        """Return a time that is a number; raise ValueError where it `is_step` and not a whole number from 0.
+
+        Where the first whole number is too large for a double, as of nanoseconds, all are counted from that one.
+        """
+        number = _parse_number(cell, name)
+        if isinstance(cell, int):
+            if self.zero is None:
+                self.zero = cell if abs(cell) >= EXACT else 0
+            number = float(cell - self.zero)
+            if self.rounded is None and int(number) != cell - self.zero:  # the first that a double does not hold
+                self.rounded = cell
+        if is_step and not (number >= 0 and number.is_integer()):
+            raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
+        return number
+
+
+class HeaderError(InputError):
+    """The columns of a file are not those of events."""
+
+
+def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
+    """Return the values of one event, NaN where one did not arrive.
+
+    They stand in the field `values`, a list or a text, or each in a field of its name. Where the event is `numbered`
+    the last, how many messages were lost, may be missing in `values`, since the running count says it too.
+    """
+    if row.get(VALUES) not in (None, ""):
+        cell = row[VALUES]
+        parts: list[Any] = cell.replace(";", " ").split() if isinstance(cell, str) else _list_cell_items(cell)
+        if numbered and len(parts) == len(names) - 1:
+            parts.append("nan" if isinstance(cell, str) else np.nan)
+        if len(parts) != len(names):
+            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", show_value(cell))
+        from_text = isinstance(cell, str)
+        place = f"{where}, column {VALUES!r}"
+        return np.array([_parse_number(word, place, may_be_empty=True, text=from_text) for word in parts])
+    return np.array([_parse_number(row.get(name), f"{where}, column {name!r}", may_be_empty=True) for name in names])
+
+
+def _list_cell_items(cell: Any) -> list[Any]:
+    """Return what is in a list or array; anything else as a list of one."""
+    return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
+
+
+def _parse_whole_number(cell: Any, name: str) -> int:
+    """Return a count with every digit; a float is accepted if it is an exact integer."""
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
+        return check_63_bits(name, int(cell))
+    if not isinstance(cell, int):
+        _parse_number(cell, name)
+    return check_63_bits(name, cell)
+
+
+def _parse_number(cell: Any, name: str, may_be_empty: bool = False, text: bool = False) -> float:
+    """Return the number in a cell, NaN of an empty one.
+
+    Args:
+        cell: the cell.
+        name: its place, for errors.
+        may_be_empty: whether it may be empty, or a word of that meaning; else that is an error.
+        text: whether a text that reads as a number is one; else it is an error.
+    """
+    if may_be_empty and (cell is None or cell == "" or (isinstance(cell, str) and NO_VALUE.fullmatch(cell))):
+        return np.nan
+    expected = "a number or an empty cell" if may_be_empty else "a number"
+    if isinstance(cell, str) and not text:
+        raise fail(name, expected, f"text, {show_value(cell)}")
+    try:
+        if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
+        number = float(cell)
+    except (TypeError, ValueError, OverflowError):
+        number = np.inf
+    if np.isinf(number) or (np.isnan(number) and not may_be_empty):
+        raise fail(name, expected, "an empty cell" if cell is None else show_value(cell))
+    return number

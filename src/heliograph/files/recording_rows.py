@@ -1,0 +1,119 @@
+"""Rows of a recording as columns: put in the order of their times, and with the steps that did not arrive."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.files.table import TIME
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.row_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
+from heliograph.numerics.times.row_times import find_backwards_row
+from heliograph.simulation.network import Network
+
+MOST_OUT = 0.5  # share of the rows below which those that are out of order, or whose times were not set, are refused
+
+
+class RecordingRows(NamedTuple):
+    """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
+
+    numbers: np.ndarray
+    time: np.ndarray
+    measurements: dict[str, np.ndarray]
+    inputs: dict[str, np.ndarray]
+    truth: dict[str, np.ndarray]
+
+    def select(self, good: np.ndarray | slice) -> "RecordingRows":
+        """Return the rows of a mask, of numbers, or of a slice."""
+        parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
+        return RecordingRows(self.numbers[good], self.time[good], *parts)
+
+
+def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
+    """Return the rows of several parts of a table, one after the other."""
+    named = (
+        {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
+        for i in range(2, len(RecordingRows._fields))
+    )
+    return RecordingRows(np.concatenate([p.numbers for p in parts]), np.concatenate([p.time for p in parts]), *named)
+
+
+def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[RecordingRows, list[InputError], int]:
+    """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
+
+    Where time is continuous a time that is more than a year outside of all others was not set: its row is refused, and
+    the others are put in the order of their times. Where each row is a step, rows are refused until times do not go
+    backwards, as few as possible. Rows stay as they are where half of them or more would be refused, and beside a
+    column `dt`, whose numbers belong to the order of the rows.
+
+    Args:
+        cells: the rows.
+        network: the network that they belong to.
+        source: name of the table, for errors.
+    """
+    if find_backwards_row(cells.time) is None:
+        return cells, [], 0
+    dated = cells.time.dtype.kind == "M"
+    stamps = cells.time.astype(np.int64) if dated else cells.time
+    is_continuous = TIME_STEP in network.inputs
+    if is_continuous:
+        is_refused = find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND)
+        expected = "a time that was set, near the others"
+    else:
+        is_refused = find_out_of_order(stamps)
+        expected = "a time that does not go backwards"
+    if TIME_STEP in cells.inputs or np.mean(is_refused) >= MOST_OUT:
+        return cells, [], 0
+    refused = [
+        fail(f"{source}, row {number}, column {TIME!r}", expected, str(time) if dated else f"{time:.10g}")
+        for number, time in zip(cells.numbers[is_refused].tolist(), cells.time[is_refused], strict=True)
+    ]
+    kept = cells.select(~is_refused)
+    latest_so_far = np.maximum.accumulate(kept.time)
+    behind = int(np.count_nonzero(kept.time < latest_so_far))
+    return kept.select(np.argsort(kept.time, kind="stable")), refused, behind
+
+
+class RowsWithMissing(NamedTuple):
+    """Rows of a recording, read or missing: of a missing one the values are NaN, and the time lies between those read.
+
+    Attributes:
+        numbers: their numbers in the table, from 1.
+        read_row: index of the row that was read from which each is taken: its own, or the one before it.
+        arrived: whether it was read itself.
+    """
+
+    numbers: np.ndarray
+    read_row: np.ndarray
+    arrived: np.ndarray
+
+    def fill(self, values: np.ndarray) -> np.ndarray:
+        """Return values of these rows, NaN where one did not arrive."""
+        filled = np.array(values[self.read_row], dtype=np.float64)
+        filled[~self.arrived] = np.nan
+        return filled
+
+    def fill_times(self, time: np.ndarray) -> np.ndarray:
+        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
+        missing = np.flatnonzero(~self.arrived)
+        filled = np.array(time[self.read_row])
+        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
+        before, after = self.read_row[missing], np.minimum(self.read_row[missing] + 1, len(time) - 1)
+        numbers = self.numbers[self.arrived]
+        share = np.maximum(self.numbers[missing] - numbers[before], 0) / np.maximum(numbers[after] - numbers[before], 1)
+        moved = share * (time[after] - time[before]).astype(np.float64)
+        filled[missing] += moved.astype("timedelta64[ns]" if time.dtype.kind == "M" else time.dtype)
+        return filled
+
+
+def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -> RowsWithMissing:
+    """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
+
+    Steps begin with the row of number `first`.
+    """
+    if TIME_STEP in network.inputs or not len(numbers):
+        return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))
+    steps = np.arange(first, numbers[-1] + 1)
+    before = np.maximum(np.searchsorted(numbers, steps, side="right") - 1, 0)
+    return RowsWithMissing(steps, before, numbers[before] == steps)

@@ -1,0 +1,108 @@
+"""Order of rows that are read in blocks: whether blocks put in order by themselves are in the order of all rows."""
+
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.recording_rows import RecordingRows
+from heliograph.files.table import TIME
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
+from heliograph.numerics.times.timestamp_order import SECOND, YEAR
+from heliograph.simulation.network import Network
+
+
+class RowsNotInBlocksError(InputError):
+    """Rows of which only all together say in which order they are, or of which kind: one line that names the first."""
+
+
+class BlockOrderCheck:
+    """Compares blocks, each in the order of its times by itself, with what `order_rows` makes of all rows together.
+
+    Sorted blocks of which each begins where the one before it ended are all rows sorted. Where each row is a step the
+    fewest rows are left out of all if they are of each block, and none falls behind the block before it. Where time is
+    continuous a stamp is left out that is more than a year outside of all others: a block says so of its own rows, so
+    what it left out has to be outside of those of all blocks, and there may be no steps of a year beside rows out of
+    order, since these may be stretches of stamps that were not set.
+
+    Args:
+        path: the file, for errors.
+        network: the network that the rows belong to.
+
+    Attributes:
+        last: the last row so far; None before the first.
+    """
+
+    def __init__(self, path: Path, network: Network):
+        self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
+        self.last: RecordingRows | None = None
+        self._first: RecordingRows | None = None
+        self._disordered: RecordingRows | None = None  # two rows of which the second came after a later one
+        self._jump: RecordingRows | None = None  # two rows between which is more than a year
+        self._left_out = list[RecordingRows]()  # of each block those with the least and the greatest time
+
+    def check_block(self, came: RecordingRows, ordered: RecordingRows) -> None:
+        """Check that a block goes on from the rows before it, and note what decides on the order of all rows.
+
+        Args:
+            came: rows of the block as they came.
+            ordered: those that are left of them, in the order of their times.
+
+        Raises:
+            RowsNotInBlocksError: only all rows together say in which order they are.
+        """
+        if self.last is not None and self.last.time.dtype != ordered.time.dtype:
+            where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
+            raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
+        rows = ordered if self.last is None else _join_times(self.last, ordered)
+        if (row := find_backwards_row(rows.time)) is not None:
+            raise self._make_refusal(rows.select(slice(row - 1, row + 1)), "a time that does not go backwards")
+        self.last = ordered.select(slice(-1, None))
+        if self._first is None:
+            self._first = ordered.select(slice(1))
+        if self._rows_are_steps:
+            return
+        # A step of more than a year, and rows out of order, in whichever blocks: the rows behind the step may all have
+        # stamps that were not set, which a block cannot tell.
+        if len(jumps := np.flatnonzero(np.diff(rows.time) > _year_in_unit_of(rows.time))):
+            self._jump = rows.select(slice(int(jumps[0]), int(jumps[0]) + 2))
+        if (row := find_backwards_row(came.time)) is not None:
+            self._disordered = came.select(slice(row - 1, row + 1))
+        if self._jump is not None and self._disordered is not None:
+            raise self._make_refusal(self._disordered, "times in order, in a recording with steps of more than a year")
+        # What the block left out is compared with all rows at the end: its earliest and its latest stand for it.
+        left_out = came.select(~np.isin(came.numbers, ordered.numbers))
+        if len(left_out.numbers):
+            self._left_out.append(left_out.select(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
+
+    def check_left_out_rows(self) -> None:
+        """Check that all rows that blocks left out are more than a year outside of all that stay.
+
+        Raises:
+            RowsNotInBlocksError: one that is not.
+        """
+        if self._first is None or self.last is None:
+            return
+        first, last = self._first.time[0], self.last.time[0]
+        year = _year_in_unit_of(self._first.time)
+        for rows in self._left_out:
+            for row in range(2):
+                if first - year <= rows.time[row] <= last + year:
+                    raise self._make_refusal(_join_times(self.last, rows.select(slice(row, row + 1))), "times in order")
+
+    def _make_refusal(self, rows: RecordingRows, expected: str) -> RowsNotInBlocksError:
+        """Return the error that names the second of two rows."""
+        where = f"{self._path}, row {rows.numbers[1]}, column {TIME!r}"
+        return RowsNotInBlocksError(str(fail(where, expected, backwards_text(rows.time, 1))))
+
+
+def _join_times(before: RecordingRows, after: RecordingRows) -> RecordingRows:
+    """Return the numbers and times of rows behind others."""
+    numbers, time = (np.concatenate([before[i], after[i]]) for i in range(2))
+    return RecordingRows(numbers, time, {}, {}, {})
+
+
+def _year_in_unit_of(time: np.ndarray) -> np.timedelta64 | float:
+    """Return a year in the unit of times."""
+    return np.timedelta64(YEAR, "ns") if time.dtype.kind == "M" else YEAR / SECOND

@@ -1,0 +1,304 @@
+"""Topics and fields of messages: patterns of topics, what stands at a dotted path, and its conversion to a number."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from decimal import Decimal
+from functools import lru_cache
+from math import isfinite
+from operator import attrgetter
+from typing import Any, Literal
+
+import numpy as np
+
+from heliograph.files.text.csv_dialects import NO_VALUE
+from heliograph.live.event import check_63_bits
+from heliograph.numerics.check import InputError, fail, show_value
+from heliograph.numerics.times.dates import UNITS, parse_dates, parse_instant
+
+TimeUnit = Literal["s", "ms", "us", "ns", "step"]
+# Fields of a stamp, of seconds and nanoseconds: of ROS 2 and 1, protobuf, Foxglove.
+STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
+PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
+NUMBER = "a number, true or false, or null for what did not arrive"
+# Bare words that C, C++ and JavaScript print for what is no number, outside of texts.
+NO_NUMBERS = re.compile(
+    r'"(?:[^"\\]|\\.)*"|[-+]?\b(?:nan\([a-z0-9]*\)|(?:nan|inf(?:inity)?)\b|1\.#(?:q?nan|snan|ind|inf)\d*)',
+    re.IGNORECASE,
+)
+
+
+class MissingFieldError(InputError):
+    """A message has no field at a path."""
+
+
+def decode_json(text: str | bytes, name: str) -> Any:
+    """Return the content of JSON, in which a bare nan or inf, as printf writes them, is null; `name`: for errors.
+
+    Raises:
+        ValueError: no JSON, or a field that is there twice; one line.
+    """
+    content, doubled = _decode_json(text, name)
+    if doubled:
+        raise fail_of_doubled(name, doubled[0][1])
+    return content
+
+
+def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
+    """Return each item of a list of JSON, or of lists in it, else the one content, read as `decode_json` does.
+
+    Returns:
+        Each item, and a field that is there twice within it, None if none is.
+
+    Raises:
+        ValueError: no JSON; one line.
+    """
+    content, doubled = _decode_json(text, name)
+    return [(item, _name_doubled_field(item, doubled)) for item in _flatten_lists(content)]
+
+
+def fail_of_doubled(name: str, field: str) -> InputError:
+    """Return the error of an object of JSON that has a field twice, of which decoders use the last."""
+    return fail(name, "distinct fields", f"{field!r} more than once")
+
+
+def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
+    """Return the content of JSON, and each object in it that has a field twice, with the field's name.
+
+    `name`: of the text, for errors. Words such as nan or inf, which are no JSON, are null.
+    """
+    doubled: list[tuple[dict[str, Any], str]] = []
+
+    def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Return the fields of an object, and note the object if it has one twice."""
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
+            names = [name for name, _ in pairs]
+            doubled.append((fields, next(name for name in names if names.count(name) > 1)))
+        return fields
+
+    # First as it is, which is fast; then once more with null for words such as nan outside of texts.
+    try:
+        return json.loads(text, object_pairs_hook=collect), doubled
+    except ValueError:
+        doubled.clear()
+    except RecursionError:
+        raise fail(name, "JSON", "brackets nested too deeply") from None
+    try:
+        decoded = text.decode() if isinstance(text, bytes) else text
+        repaired = NO_NUMBERS.sub(lambda match: match[0] if match[0][0] == '"' else "null", decoded)
+        return json.loads(repaired, object_pairs_hook=collect), doubled
+    except (ValueError, RecursionError):  # also bytes that are no text
+        raise fail(name, "JSON", show_value(text)) from None
+
+
+def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
+    """Return the name of a field that `content`, or an object in it, has twice; None if there is none.
+
+    `doubled`: the objects that have one, with its name, as they were found on decoding.
+    """
+    if not doubled or not isinstance(content, dict | list):
+        return None
+    field_of_content = next((field for fields, field in doubled if fields is content), None)
+    if field_of_content is not None:
+        return field_of_content
+    parts = content.values() if isinstance(content, dict) else content
+    return next((field for part in parts if (field := _name_doubled_field(part, doubled)) is not None), None)
+
+
+def _flatten_lists(content: object) -> Iterator[object]:
+    """Yield each item of a list, or of lists in it; what is no list as the one item."""
+    for item in content if isinstance(content, list) else [content]:
+        yield from _flatten_lists(item) if isinstance(item, list) else [item]
+
+
+def match_topic(topic: str, pattern: str) -> bool:
+    """Return whether a topic matches a pattern with the wildcards of MQTT: + for one word, # for all that follow."""
+    if topic == pattern:
+        return True
+    words, parts = topic.split("/"), pattern.split("/")
+    if parts[-1] == "#":
+        words, parts = words[: len(parts) - 1], parts[:-1]
+    return len(words) == len(parts) and all(level in ("+", word) for word, level in zip(words, parts, strict=True))
+
+
+def field_at(message: object, path: str, where: str) -> Any:
+    """Return the field at a dotted path of a message: of dictionaries, lists, arrays and objects with attributes.
+
+    Args:
+        message: the message, decoded.
+        path: names between dots, positions in lists as numbers; "" for the message itself.
+        where: place of the message, for errors.
+
+    Raises:
+        ValueError: no such field; one line with the path and the fields that are there.
+    """
+    # A message of a bag is an object with attributes, and there are millions: all of the path at once, if it has them.
+    if path and not isinstance(message, PLAIN):
+        with suppress(AttributeError):
+            return _make_attribute_getter(path)(message)
+    value: Any = message
+    rest = path
+    while rest:
+        # A name that has dots itself comes first.
+        if isinstance(value, Mapping) and rest in value:
+            return value[rest]
+        name, _, rest = rest.partition(".")
+        # A key of a dictionary, a position in a list, an attribute of any other object.
+        if isinstance(value, Mapping) and name in value:
+            value = value[name]
+        elif name.isdigit() and isinstance(value, list | tuple | np.ndarray) and int(name) < len(value):
+            value = value[int(name)]
+        elif hasattr(value, name) and not isinstance(value, list | tuple | np.ndarray | Mapping | str | int | float):
+            value = getattr(value, name)
+        else:
+            raise MissingFieldError(str(fail(where, f"a field {path!r}", f"no {name!r} in {_list_field_names(value)}")))
+    return value
+
+
+@lru_cache
+def _make_attribute_getter(path: str) -> "attrgetter[Any]":
+    """Return what reads a dotted path of attributes."""
+    return attrgetter(path)
+
+
+def convert_number(value: Any, name: str, quoted: bool = False) -> float:
+    """Return a value as a double; NaN for null, for words of that meaning, and for what is not finite.
+
+    A text of a number is one only where it may be `quoted`.
+    """
+    if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
+        return np.nan
+    if quoted and isinstance(value, str):
+        value = parse_number(value)
+    if not isinstance(value, bool | int | float | np.number | np.bool_):
+        raise fail(name, NUMBER, show_value(value))
+    try:
+        numeric = float(value)
+    except OverflowError:
+        raise fail(name, NUMBER, show_value(value)) from None
+    return numeric if isfinite(numeric) else np.nan
+
+
+def parse_number(text: str) -> int | float | str:
+    """Return the number that a text is, whole ones with every digit; a text that is none as it is."""
+    words = text.strip()
+    kind = int if words.lstrip("+-").isdecimal() else float
+    try:
+        return text if "_" in words else kind(words)  # Python's own way to write a number, and nobody else's
+    except ValueError:
+        return text
+
+
+def is_stamp(value: object) -> bool:
+    """Return whether decoded JSON is a stamp of two whole numbers, seconds and nanoseconds, and nothing else."""
+    return isinstance(value, Mapping) and any(set(pair) == value.keys() for pair in STAMPS)
+
+
+def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) -> int:
+    """Return a time in nanoseconds since 1970, or as a step if that is its unit.
+
+    Args:
+        value: a stamp of two whole numbers, a date with its zone, or a number.
+        unit: of a number.
+        name: of the value, for errors.
+        quoted: whether a number in quotes is one.
+
+    Raises:
+        ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
+    """
+    stamp = None if isinstance(value, int | float | str) else _read_stamp(value, name)
+    if stamp is not None:
+        return _convert_number_to_nanoseconds(stamp, "ns", name)
+    # Dates, then numbers in their unit.
+    if isinstance(value, str):
+        value = parse_number(value) if quoted else value
+    if isinstance(value, str):
+        try:
+            parse_instant(value)
+        except ValueError:
+            raise fail(name, "a date of ISO 8601 with its zone", show_value(value)) from None
+        return int(parse_dates([value], name)[0].astype(np.int64))
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+        raise fail(name, "a time: a date with its zone, a stamp, or a number", show_value(value))
+    if unit == "step":
+        return convert_count(value, name)
+    return _convert_number_to_nanoseconds(value, unit, name)
+
+
+def _read_stamp(value: Any, name: str) -> int | None:
+    """Return the nanoseconds since 1970 of a stamp of two whole numbers, a dictionary or an object; None of others.
+
+    Raises:
+        ValueError: a stamp of zero, which nobody has set; one line that begins with `name`.
+    """
+    is_map = isinstance(value, Mapping)
+    for pair in STAMPS:
+        if set(pair) <= value.keys() if is_map else hasattr(value, pair[0]) and hasattr(value, pair[1]):
+            seconds, nanoseconds = (int(value[part] if is_map else getattr(value, part)) for part in pair)
+            if seconds == nanoseconds == 0:
+                raise fail(name, "a time that was set (without time= it is the moment of arrival)", "a stamp of 0")
+            return seconds * 10**9 + nanoseconds
+    return None
+
+
+def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
+    """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it."""
+    # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
+    is_whole = float(value).is_integer()
+    stamp = int(value) * UNITS[unit] if is_whole else round(Decimal(repr(float(value))) * UNITS[unit])
+    if not -(2**63) < stamp < 2**63:
+        fits = next((other for other, size in UNITS.items() if 0 <= float(value) * size < 2**63), None)
+        hint = "" if fits is None else f": in {fits} it is one (time_unit={fits!r})"
+        raise fail(name, f"a time in {unit} since 1970", f"{show_value(value)}{hint}")
+    return stamp
+
+
+def parse_arrival(value: Any, name: str) -> int:
+    """Return what a log says of an arrival, a date or seconds, also as a text, in nanoseconds since 1970."""
+    if isinstance(value, np.datetime64):
+        return int(value.astype("datetime64[ns]").astype(np.int64))
+    return convert_time(value, "s", name, quoted=True)
+
+
+def parse_start(name: str, start: object) -> int:
+    """Return the date from which a clock counts in nanoseconds since 1970.
+
+    Raises:
+        ValueError: no date with a zone; one line.
+    """
+    if not isinstance(start, str):
+        raise fail(name, "a date of ISO 8601 with its zone, such as 2026-09-27T10:00:00Z", show_value(start))
+    return convert_time(start, "s", name)
+
+
+def convert_count(value: Any, name: str, quoted: bool = False) -> int:
+    """Return a running count, which columns of numbers have as a float; a text of it only where it may be `quoted`."""
+    if quoted and isinstance(value, str):
+        value = parse_number(value)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return check_63_bits(name, value)
+
+
+def convert_name(value: Any, name: str) -> str:
+    """Return the name of a plant or a node as a text; it may be a whole number."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    if not isinstance(value, str):
+        raise fail(name, "a name", show_value(value))
+    return value
+
+
+def _list_field_names(value: object) -> str:
+    """Return the names of a value's fields for an error; the value itself where it has no fields."""
+    if isinstance(value, Mapping):
+        names = [str(key) for key in value]
+    elif hasattr(value, "__dataclass_fields__"):
+        names = list(value.__dataclass_fields__)
+    else:
+        return show_value(value) if not isinstance(value, list | np.ndarray) else f"a list of {len(value)}"
+    return ", ".join(name for name in names if not re.match("__", name))[:200] or "an empty message"

@@ -1,0 +1,79 @@
+"""Clocks of the topics of a recording without arrivals: whether their times are of one clock."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliograph.files.sources.json_field import Source
+from heliograph.files.sources.message_fields import field_at
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.dates import looks_like_date
+from heliograph.numerics.times.timestamp_order import YEAR
+
+
+@dataclass
+class TopicClock:
+    """The clock of a topic, as far as its times show it.
+
+    Attributes:
+        path: dotted path of its time.
+        numbers: whether times are numbers, and not dates.
+        first: the first of them, in nanoseconds since 1970.
+        count: how many there were.
+        far_from_1970: how many were a year or more away from 1970.
+    """
+
+    path: str
+    numbers: bool
+    first: int
+    count: int = 0
+    far_from_1970: int = 0
+
+    @property
+    def counts_from_own_start(self) -> bool:
+        """Return whether it counts from its own start: its times are numbers, of which most are within a year of 0."""
+        return self.numbers and 2 * self.far_from_1970 <= self.count
+
+
+class TopicClocks:
+    """Clocks by topic, of messages that nothing dates but their own times."""
+
+    def __init__(self) -> None:
+        self._by_topic: dict[str, TopicClock] = {}
+
+    def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
+        """Note the time of a message, in nanoseconds since 1970."""
+        clock = self._by_topic.get(topic)
+        if clock is None:
+            path, value = _find_time_field(topic, content, sources)
+            clock = TopicClock(path, not (isinstance(value, str) and looks_like_date(value)), time)
+            self._by_topic[topic] = clock
+        clock.count += 1
+        clock.far_from_1970 += abs(time) >= YEAR
+
+    def find_topics_without_dates(self, place: str) -> list[str]:
+        """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
+
+        Raises:
+            ValueError: some count from their own start and others are dates; one line with the remedy.
+        """
+        from_zero = [topic for topic, clock in self._by_topic.items() if clock.counts_from_own_start]
+        dated = next((topic for topic in self._by_topic if topic not in from_zero), None)
+        if from_zero and dated is not None:
+            topic, clock = from_zero[0], self._by_topic[from_zero[0]]
+            date = f"{np.datetime_as_string(np.datetime64(self._by_topic[dated].first, 'ns'), unit='s')}Z"
+            remedy = f"such as time=hg.files.Stamp({clock.path!r}, start={date!r}), with the date of its 0"
+            expected = f"dates as in {dated}, from {date} on ({remedy})"
+            raise fail(f"{place}, {topic}, field {clock.path!r}", expected, f"numbers from {clock.first / 1e9:g} s")
+        return from_zero
+
+
+def _find_time_field(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
+    """Return path and value of the first time field of some sources that the message has; ("", None) if none."""
+    for source in sources:
+        if source.time is not None:
+            with suppress(InputError):
+                return source.time.path, field_at(content, source.time.path, topic)
+    return "", None

@@ -1,0 +1,199 @@
+"""Answers of InfluxDB as the columns of one table: of InfluxQL and SQL in JSON, of Flux in annotated CSV."""
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.stores.store_address import StoreAddress
+from heliograph.numerics.check import InputError, fail
+
+SAID = 200  # characters of what a server says
+Answer = tuple[str, dict[str, Any]]  # the measurement's name and its columns: lists, and `time` as datetime64[ns]
+Row = Mapping[str, Any]
+
+
+def parse_influxql_response(address: StoreAddress, answer: bytes) -> Answer:
+    """Return the table of an answer to InfluxQL; several series, as of GROUP BY, become one, with tags as columns.
+
+    Raises:
+        ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
+    """
+    try:
+        results = json.loads(answer)["results"]  # one for each statement
+    except (ValueError, KeyError, TypeError):
+        raise fail(str(address), "an answer of InfluxDB in JSON", repr(answer[:40])) from None
+    refusal = next((result["error"] for result in results if "error" in result), None)
+    if refusal is not None:
+        raise fail(str(address), "a query that it answers", shorten_answer(str(refusal)))
+    # A series has a name, tags that all its rows share, names of columns, and rows of values.
+    all_series = [series for result in results for series in result.get("series", ())]
+    if any(part.get("partial") for part in (*results, *all_series)):
+        raise fail(str(address), "all rows of the query", "a part of them, as the server limits their number")
+    rows = [
+        _join_row_with_tags(address, series.get("tags", {}), dict(zip(series["columns"], values, strict=True)))
+        for series in all_series
+        for values in series["values"]
+    ]
+    names = [name for series in all_series for name in (*series["columns"], *series.get("tags", {}))]
+    measurement = str(all_series[0].get("name", address.table)) if all_series else ""
+    # Each series is in order of time by itself.
+    is_unsorted = len(all_series) > 1
+    return measurement, _make_columns(address, names, rows, read_time=lambda time: int(time), sorts=is_unsorted)
+
+
+def parse_sql_response(address: StoreAddress, answer: bytes) -> Answer:
+    """Return the table of an answer of version 3 to SQL, a list of rows, each an object of JSON.
+
+    Raises:
+        ValueError: no such answer, no rows; one line.
+    """
+    try:
+        rows = json.loads(answer)
+    except ValueError:
+        rows = None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise fail(str(address), "rows of InfluxDB 3 in JSON", repr(answer[:40]))
+    names = [name for row in rows for name in row]
+    return address.database, _make_columns(address, names, rows, read_time=_read_moment, sorts=False)
+
+
+def parse_flux_response(address: StoreAddress, answer: bytes) -> Answer:
+    """Return the table of an answer to Flux: tables of CSV, each row of which has one field's value at one time.
+
+    Values of one measurement, one time and the same tags are one row, as after `pivot`, which a query may do itself.
+    `_time` is the time, `_measurement` the name; `result`, `table`, `_start` and `_stop` tell how the answer was
+    made: left out.
+
+    Raises:
+        ValueError: no such answer, an error in it, no rows; one line.
+    """
+    try:
+        measurement, rows = _join_flux_rows(address, _yield_flux_rows(answer.decode()))
+    except InputError:
+        raise
+    except (ValueError, KeyError, csv.Error):
+        raise fail(str(address), "tables of InfluxDB in annotated CSV", repr(answer[:40])) from None
+    names = [name for row in rows for name in row]
+    return measurement or address.database, _make_columns(address, names, rows, read_time=_read_moment, sorts=True)
+
+
+def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tuple[str, list[dict[str, Any]]]:
+    """Return the name of the first measurement among rows of Flux, and the rows, values of one time and tags joined.
+
+    Args:
+        address: where they came from, for errors.
+        rows: by name of the column; they are changed.
+
+    Raises:
+        ValueError: an error in the place of a row; a tag of a field's name.
+    """
+    joined: dict[tuple[object, ...], dict[str, Any]] = {}
+    first_measurement = ""
+    for number, row in enumerate(rows):
+        if "error" in row:
+            raise fail(str(address), "a query that it answers", shorten_answer(str(row["error"])))
+        measurement = str(row.pop("_measurement", ""))
+        first_measurement = first_measurement or measurement
+        for name in ("result", "table", "_start", "_stop"):
+            row.pop(name, None)
+        if "_time" in row:
+            row["time"] = row.pop("_time")
+        if "_field" not in row or "_value" not in row:  # pivoted, or columns of a query's own: a row by itself
+            joined[(number,)] = row
+            continue
+        name, value = str(row.pop("_field")), row.pop("_value")
+        # What is left are the time and the tags, which all fields of one row share.
+        fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
+        fields |= _join_row_with_tags(address, row, {name: value})
+    return first_measurement, list(joined.values())
+
+
+def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
+    """Return the columns of a row with its tags.
+
+    Raises:
+        ValueError: a tag of a column's name, with another value: one of the two would be lost.
+    """
+    both = [name for name in tags if name in columns and tags[name] != columns[name]]
+    if both:
+        remedy = (
+            f"tags and columns of different names (AS in the query, or rename() of Flux, gives {both[0]!r} another)"
+        )
+        raise fail(str(address), remedy, f"{both[0]!r} for both")
+    return {**tags, **columns}
+
+
+def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
+    """Yield the rows of all tables by name of the column, with values of the columns' types; empty ones are None.
+
+    A table has a line of types, one of names, its rows, and then an empty line.
+    """
+    types: list[str] = []
+    names: list[str] = []  # of the columns of this table; [] until they come
+    for cells in csv.reader(text.splitlines()):
+        if not any(cells):
+            names = []
+        elif cells[0] == "#datatype":
+            types, names = cells, []
+        elif cells[0].startswith("#"):  # another annotation
+            continue
+        elif not names:
+            names = cells
+        else:
+            # Without types, as of an error, cells are texts.
+            types_of_row = types if len(types) == len(names) else [""] * len(names)
+            yield {
+                name: None if cell == "" else READ.get(type_, str)(cell)
+                for name, type_, cell in zip(names, types_of_row, cells, strict=True)
+                if name  # the first column has annotations alone
+            }
+
+
+# What reads a cell, by the type of its column; others are texts.
+READ: dict[str, Callable[[str], Any]] = {
+    "double": float,
+    "long": int,
+    "unsignedLong": int,
+    "boolean": lambda cell: cell == "true",
+}
+
+
+def _read_moment(time: object) -> int:
+    """Return the nanoseconds of a date of UTC, as 2026-11-29T10:00:00.123456789Z."""
+    return int(np.datetime64(str(time).removesuffix("Z"), "ns").astype(np.int64))
+
+
+def _make_columns(
+    address: StoreAddress, names: Iterable[str], rows: list[Any], read_time: Callable[[Any], int], sorts: bool
+) -> dict[str, Any]:
+    """Return rows as the columns of one table.
+
+    Args:
+        address: where they came from, for errors.
+        names: names of the columns, which may repeat.
+        rows: the rows, by name.
+        read_time: makes nanoseconds since 1970 of a time.
+        sorts: whether rows are of several series, and are put in the order of time.
+    """
+    if not rows:
+        raise fail(str(address), "a query with rows", "none")
+    known = list(dict.fromkeys(names))
+    if "time" not in known:
+        raise fail(str(address), "a query that returns time", f"the columns {', '.join(known)}")
+    try:
+        moments = np.array([read_time(row["time"]) for row in rows], dtype=np.int64)
+    except (KeyError, ValueError, TypeError):
+        raise fail(str(address), "a time in each row", "one that is none") from None
+    order = np.argsort(moments, kind="stable") if sorts else np.arange(len(rows))
+    columns: dict[str, Any] = {name: [rows[i].get(name) for i in order] for name in known}
+    columns["time"] = moments[order].view("datetime64[ns]")
+    return columns
+
+
+def shorten_answer(said: str) -> str:
+    """Return what a server says as one line of at most 200 characters."""
+    line = " ".join(said.split())
+    return line if len(line) <= SAID else f"{line[:SAID]}..."

@@ -1,0 +1,138 @@
+"""Addresses of stores: a URL with a query or a table; secrets are never printed."""
+
+import os
+import re
+from dataclasses import dataclass, field, replace
+from typing import Literal, cast
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+SHAPE = "influx://HOST:PORT/DATABASE or postgresql://HOST/DATABASE, with ?table=NAME or ?query=SELECT..."
+INFLUX, POSTGRES = ("influx", "influxs"), ("postgresql",)
+USER, PASSWORD = "HELIOGRAPH_STORE_USER", "HELIOGRAPH_STORE_PASSWORD"
+ESTIMATES = "estimates"  # the table that is written, unless the URL names another
+Language = Literal["query", "flux", "sql"]  # InfluxQL, or the SQL of PostgreSQL; Flux; the SQL of InfluxDB 3
+ASKS = re.compile(r"(?<=[?&])(query|flux|sql)=")  # begins a statement, which goes to the end of the URL
+
+
+@dataclass(frozen=True)
+class StoreAddress:
+    """Where a table is kept, or what asks for one; printed it is the URL without user, password and query.
+
+    Attributes:
+        kind: scheme of the URL: "influx", "influxs" (TLS) or "postgresql".
+        url: the URL without table and query, with its secrets.
+        database: name of the database; of InfluxDB 2 that of a bucket.
+        table: table (of InfluxDB a measurement) that is read or written; "" if the URL names none.
+        query: statement that is asked instead; "" if the URL has none.
+        language: of the statement, as the URL names it.
+        organisation: of InfluxDB 2, in which Flux is asked; "" if the URL names none.
+    """
+
+    kind: str
+    url: str = field(repr=False)
+    database: str
+    table: str
+    query: str = field(repr=False)
+    language: Language = "query"
+    organisation: str = ""
+
+    def __str__(self) -> str:
+        parts = urlsplit(self.url)
+        host = f"{parts.hostname or ''}{'' if parts.port is None else f':{parts.port}'}"
+        return f"{self.kind}://{host}/{self.database}{f'?table={self.table}' if self.table else ''}"
+
+    @property
+    def table_for_estimates(self) -> str:
+        """Return the table that estimates are written to."""
+        return self.table or ESTIMATES
+
+    def with_table(self, table: str) -> "StoreAddress":
+        """Return the address of another table there."""
+        return replace(self, table=table)
+
+    @property
+    def user_and_password(self) -> tuple[str, str]:
+        """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none."""
+        parts = urlsplit(self.url)
+        user = os.environ.get(USER) or unquote(parts.username or "")
+        return user, os.environ.get(PASSWORD) or unquote(parts.password or "")
+
+
+def is_store(location: object) -> bool:
+    """Return whether a text is the URL of a store, and not the name of a file."""
+    return isinstance(location, str) and location.split("://")[0] in (*INFLUX, *POSTGRES) and "://" in location
+
+
+ASKED = "one of table=NAME and query=SELECT..."
+
+
+def parse_store(url: str) -> StoreAddress:
+    """Read the URL of a store: SCHEME://user:password@host:port/database?table=NAME, or ...?query=SELECT ....
+
+    What follows `query=`, of InfluxDB also `flux=` or `sql=`, is the statement to its end, & included; a % in it is
+    written %25. Of PostgreSQL other parameters, as sslmode=require, are the server's; of InfluxDB 2 org=NAME is known.
+
+    Raises:
+        ValueError: another kind of URL, no database, both table and query; one line without the password.
+    """
+    from heliograph.numerics.check import fail, text  # not before a command needs it
+
+    text("store", url)
+    # "scheme://.../database?options", then "query", "flux" or "sql" and the statement, where there is one.
+    location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
+    try:
+        parts = urlsplit(location)
+        host, _ = parts.hostname, parts.port  # `port` is read because it raises at one that is no number
+    except ValueError:
+        raise fail("store", SHAPE, "an address that cannot be read") from None
+    database = unquote(parts.path).strip("/")
+    is_influx = parts.scheme in INFLUX
+    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):
+        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
+    store = f"store {parts.scheme}://{host or ''}/{database}"
+    table, organisation = _read_options(store, parts.query, is_influx, asks=bool(language))
+    # One table or one statement, in a language that the server has.
+    if language and not statement.strip():
+        raise fail(store, ASKED, "both, or one without a value")
+    if not is_influx and language not in ("", "query"):
+        raise fail(store, "query=SELECT..., as InfluxDB alone has others", language)
+    # PostgreSQL gets its own options in the URL; those of InfluxDB have been read.
+    kept = [option for option in parts.query.split("&") if not is_influx and not option.startswith("table=")]
+    return StoreAddress(
+        kind=parts.scheme,
+        url=urlunsplit((parts.scheme, parts.netloc, parts.path, "&".join(kept), "")),
+        database=database,
+        table=table,
+        query=unquote(statement),
+        language=cast(Language, language or "query"),
+        organisation=organisation,
+    )
+
+
+def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tuple[str, str]:
+    """Return the table and the organisation that options of a URL name, "" where they name none.
+
+    Args:
+        store: the store, for errors.
+        options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
+        is_influx: whether the store is InfluxDB, which has no others.
+        asks: whether the URL has a statement, beside which no table may stand.
+
+    Raises:
+        ValueError: an option that InfluxDB has not, several tables, a table beside a statement.
+    """
+    from heliograph.numerics.check import fail
+
+    with_table = [unquote(option) for option in options.split("&") if option]
+    tables = [option.removeprefix("table=") for option in with_table if option.startswith("table=")]
+    others = [option for option in with_table if not option.startswith("table=")]
+    organisation = ""
+    if is_influx and len(others) == 1 and others[0].startswith("org="):
+        organisation = others.pop().removeprefix("org=")
+    if is_influx and others:
+        raise fail(store, ASKED, others[0].split("=")[0])
+    if asks and tables:
+        raise fail(store, ASKED, "both, or one without a value")
+    if len(tables) > 1:
+        raise fail(store, ASKED, "several")
+    return (tables[0] if tables else ""), organisation

@@ -1,0 +1,170 @@
+"""Tables of stores: what came for a query, as columns and as messages; estimates written."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import date
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.estimates.estimates_table import estimate_columns
+from heliograph.files.messages.message_files import FileMessage, make_message_of_row
+from heliograph.files.stores.store_address import INFLUX, StoreAddress, parse_store
+from heliograph.files.table import TIME, convert_to_columns
+from heliograph.files.table_rows import TableRows
+from heliograph.numerics.check import fail, instance, text
+from heliograph.numerics.process.optional_packages import check_installed
+from heliograph.simulation.results.record import Record
+
+
+@dataclass(frozen=True)
+class StoreTable:
+    """What came for a query; printed it is the address.
+
+    Attributes:
+        address: where it came from.
+        topic: topic of rows without a column `topic`: the measurement's name, or the database's.
+        columns: columns of equal length, by name.
+    """
+
+    address: StoreAddress
+    topic: str
+    columns: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return str(self.address)
+
+    def rows(self, only: Mapping[str, str] | None) -> TableRows:
+        """Return numbers and dates, of the columns among `only`.
+
+        Raises:
+            ValueError: a column of text; one line.
+        """
+        columns = convert_to_columns(self.columns, str(self), only)
+        count = len(next(iter(self.columns.values()), ()))
+        return TableRows(columns, np.arange(1, count + 1), [])
+
+    def messages(self) -> Iterator[FileMessage]:
+        """Yield each row as a message, with dates as text of ISO 8601."""
+        names = list(self.columns)
+        for number, cells in enumerate(zip(*self.columns.values(), strict=True), 1):
+            row = {name: _convert_cell(cell) for name, cell in zip(names, cells, strict=True)}
+            yield make_message_of_row(f"{self}, row {number}", row)
+
+
+def _convert_cell(cell: object) -> object:
+    """Return a cell as JSON would have it."""
+    if isinstance(cell, np.datetime64):
+        return f"{cell}Z"
+    if isinstance(cell, date):  # and moments
+        return cell.isoformat()
+    return float(cell) if isinstance(cell, Decimal) else cell
+
+
+def query_store(address: StoreAddress) -> StoreTable:
+    """Return the rows of a store's query or table.
+
+    Raises:
+        ValueError: the server is away or refuses, no rows, neither a query nor a table; one line.
+        ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
+    """
+    if not address.query and not address.table:
+        raise fail(str(address), "?query=SELECT... or ?table=NAME behind it", "neither")
+    if address.kind in INFLUX:
+        from heliograph.files.stores.influx import query_influx as ask
+    else:
+        check_installed(["psycopg"])
+        from heliograph.files.stores.postgres import query_postgres as ask
+    return StoreTable(address, *ask(address))
+
+
+def check_store(address: StoreAddress) -> None:
+    """Raise now what writing to a store would raise at once: no package, no server, a query in the URL.
+
+    Raises:
+        ValueError: one line.
+        ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
+    """
+    if address.query:
+        raise fail(str(address), "the table to write, ?table=NAME", "a query")
+    if address.kind in INFLUX:
+        from heliograph.files.stores.influx import check_influx as check
+    else:
+        check_installed(["psycopg"])
+        from heliograph.files.stores.postgres import check_postgres as check
+    check(address)
+
+
+def write_columns_to_store(
+    address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str, origin: np.datetime64 | None
+) -> None:
+    """Write the columns of estimates; times that are seconds since `origin` become dates.
+
+    Raises:
+        ValueError: times that are numbers, of InfluxDB; the server is away or refuses; one line.
+    """
+    dated = dict(columns)
+    if origin is not None and dated[TIME].dtype.kind != "M":
+        dated[TIME] = origin.astype("datetime64[ns]") + np.round(1e9 * dated[TIME]).astype("timedelta64[ns]")
+    if address.kind in INFLUX:
+        from heliograph.files.stores.influx import write_influx
+
+        moments = dated.pop(TIME)
+        if moments.dtype.kind != "M":
+            raise fail(str(address), "times that are dates", f"the number {moments[0]:g}")
+        write_influx(address, dated, moments.astype("datetime64[ns]"), plant)
+        return
+    from heliograph.files.stores.postgres import write_postgres
+
+    write_postgres(address, dated, plant)
+
+
+def read_store(url: str) -> dict[str, np.ndarray]:
+    """Read a table of InfluxDB or PostgreSQL: the rows of a query, or of a whole table.
+
+    `influx://host:8086/database?query=SELECT ...` asks in InfluxQL, over HTTP (`influxs://` over TLS), by the endpoint
+    that versions 1, 2 (a bucket by its name) and 3 have; `?org=NAME&flux=from(...` of version 2 in Flux, `?sql=SELECT`
+    of version 3 in SQL; `postgresql://user@host/database?query=SELECT ...` in SQL, in a transaction that only reads;
+    `?table=NAME` is all of a table, or measurement. What follows `query=`, `flux=` or `sql=` is the statement to its
+    end, with % as %25. User and password, or a token alone as password, of InfluxDB stand in the URL or in
+    HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; of PostgreSQL also where libpq looks.
+
+    Args:
+        url: where to ask, and what.
+
+    Returns:
+        Columns by name, each of shape (rows,): numbers as float64, NaN where there is none; dates as datetime64[ns] in
+        UTC. `read_recording` takes them.
+
+    Raises:
+        ValueError: the server is away or refuses, no rows, no `time` in InfluxDB's answer, a column of text. One line.
+        ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
+    """
+    return query_store(parse_store(url)).rows(None).columns
+
+
+def store_estimates(record: Record, url: str, plant: str = "", origin: np.datetime64 | None = None) -> None:
+    """Write the estimates of a run to a table of InfluxDB or PostgreSQL: the columns of `write_estimates`.
+
+    Rows of the same times and plant are replaced, so that the same call twice leaves what one leaves. PostgreSQL
+    gets all or nothing, in one transaction, in a table that is made where there is none (columns `plant`, `time`, to
+    the microsecond, and the estimates'). InfluxDB gets points whose tag is the plant, in requests of four megabytes.
+
+    Args:
+        record: the result of `run`.
+        url: as for `read_store`, with `?table=NAME`; "estimates" unless given.
+        plant: name of the plant (default none).
+        origin: date of time 0, where the times of the record are seconds since then (default: they are as they are).
+
+    Raises:
+        ValueError: the server is away or refuses, times without dates in InfluxDB, a query in the URL. One line.
+        ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").
+    """
+    instance("record", record, Record, "a Record")
+    text("plant", plant)
+    if origin is not None:
+        instance("origin", origin, np.datetime64, "a numpy.datetime64")
+    address = parse_store(url)
+    check_store(address)
+    write_columns_to_store(address, estimate_columns(record), plant, origin)

@@ -1,0 +1,38 @@
+"""Lines of CSV in which nothing but numbers and empty cells stands, all at once."""
+
+import msgspec
+import numpy as np
+
+from heliograph.numerics.types import Float
+
+NUMBERS = b"0123456789+-.eE"  # all that such cells are made of
+
+
+def parse_numeric_lines(lines: bytes, columns: int) -> Float[np.ndarray, "rows columns"] | None:
+    """Return the numbers of whole lines, NaN for empty cells; None where anything in them is not plain.
+
+    JSON writes numbers as such lines do, and is read in a fifteenth of the time that a row takes with its cells one by
+    one. What it does not take, .5 or 007 or a row that is shorter, is for the reader of rows, which says why.
+    """
+    body = lines.replace(b"\r\n", b"\n")
+    if not body.endswith(b"\n"):
+        body += b"\n"
+    # Without its numbers each line is the commas between its cells.
+    empty_line = b"," * (columns - 1) + b"\n"
+    rows = body.count(b"\n")
+    if body.translate(None, NUMBERS) != empty_line * rows:
+        return None
+    # A line without a number; a zero whose sign JSON takes for nothing.
+    if b"\n" + empty_line in b"\n" + body or b"-0," in body or b"-0\n" in body:
+        return None
+    # An empty cell stands between two commas, or at an end of its line; twice, since matches do not overlap.
+    body = body.replace(b",,", b",null,").replace(b",,", b",null,")
+    body = body.replace(b",\n", b",null\n").replace(b"\n,", b"\nnull,")
+    if body.startswith(b","):
+        body = b"null" + body
+    # One list for all lines: of as many lists the collector of garbage would take more time than the rest.
+    try:
+        cells = msgspec.json.decode(b"[" + body[:-1].replace(b"\n", b",") + b"]", type=list[float | None])
+    except msgspec.DecodeError:
+        return None
+    return np.array(cells, dtype=np.float64).reshape(rows, columns)

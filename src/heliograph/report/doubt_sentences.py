@@ -1,0 +1,85 @@
+"""Sentences on what a recording contradicts: sizes and memory of innovations, constant errors, and what to do."""
+
+from collections.abc import Sequence
+
+from heliograph.report.constant_sensor_error import ConstantError
+from heliograph.report.stuck_sensors import StuckValue
+from heliograph.simulation.declared.judgement import DeclaredJudgement
+from heliograph.simulation.results.whiteness import MemoryTest
+
+
+def _format_outputs_and_sizes(outputs: Sequence[str], sizes: Sequence[float]) -> tuple[str, str]:
+    """Return " of y, z" ("" if `outputs` is [""], which means all), and the sizes as text."""
+    return f" of {', '.join(outputs)}" if outputs != [""] else "", ", ".join(f"{size:.2f}" for size in sizes)
+
+
+def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
+    of, times = _format_outputs_and_sizes(outputs, sizes)
+    return (
+        f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
+        "something out"
+    )
+
+
+def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
+    """Return the sentence on innovations that are correlated in time."""
+    return (
+        f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
+        f"last, {test.predictable:.0%} of their variance follows from {len(test.correlation)}); "
+        "links, sensors or the plant remember what the model forgets. Until that is a state of the model "
+        "(hg.model.with_bias, hg.model.with_past, a link with memory), the size of innovations cannot tell how "
+        "large the errors are"
+    )
+
+
+def say_constant_error(name: str, off: ConstantError) -> str:
+    """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it."""
+    if not off.nothing_else:
+        share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
+        return f"{name}: a constant error of {off}, would explain {share}, not all"
+    return (
+        f"{name} is off by a constant error of {off}: it pulls the estimates, and makes innovations of the others "
+        "larger too. hg.model.with_bias makes it a state, which the filter then estimates"
+    )
+
+
+def say_node_differs(off: ConstantError) -> str:
+    """Return the sentence on the output that differs from what the other nodes say by a constant."""
+    return (
+        f"nodes disagree: a constant error of {off}, explains it. By itself a node takes it for the state; "
+        "hg.model.with_bias makes it a state of its own"
+    )
+
+
+def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
+    """Return the sentence on a NIS below its interval; a filter that follows its sensor's slow error has one too."""
+    of, times = _format_outputs_and_sizes(outputs, sizes)
+    return (
+        f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
+        "Either noises are stated too large, or the sensor's error changes slowly and the filter follows it: then its "
+        "claim is too small. Innovations cannot tell the two apart, a reference can"
+    )
+
+
+def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
+    """Return what to do about an output that repeats a value: that it was refused, or how to have it refused."""
+    if refused:
+        return "what repeated for longer was refused"
+    return (
+        "what else is said of filters that use it may be due to that. "
+        f"stuck={held.stuck} of its node refuses what repeats for longer"
+    )
+
+
+def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
+    """Return the sentences on variances that messages declare, of several links after the names of their outputs.
+
+    `unit`: of the plant's time.
+    """
+    several = len(judgements) > 1
+    return [
+        f"{', '.join(judgement.outputs)}: {sentence}" if several else sentence
+        for judgement in judgements
+        for sentence in judgement.sentences(unit)
+    ]

@@ -1,0 +1,58 @@
+"""How large the squared innovations of one recording are, beside what the filter's claim makes of that recording."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.confidence_intervals import average_correlated
+from heliograph.numerics.types import Float
+from heliograph.simulation.results.whiteness import MemoryTest
+
+
+def compute_expected_squares(
+    filter: AbstractFilter, data: Float[np.ndarray, "steps m"], inputs: Float[np.ndarray, "steps inputs"]
+) -> Float[np.ndarray, "steps m"]:
+    """Return the mean square of each innovation given its recording, over its variance over all runs: 1 for most.
+
+    Behind random gains the two differ, as the state of this run differs from its mean over all runs.
+    """
+    conditioned = filter.given_record()
+    if conditioned is filter:
+        return np.ones(data.shape)
+    in_run, over_runs = (np.diagonal(one.run(data, inputs).innovation_covariances, axis1=1, axis2=2)
+                         for one in (conditioned, filter))  # fmt: skip
+    return np.where(over_runs > 0, in_run / np.where(over_runs > 0, over_runs, 1.0), 1.0)
+
+
+def compute_ratio_of_squares(
+    squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]
+) -> tuple[float, float]:
+    """Return the ratio of the squares' mean to that expected of them, 1 where a claim holds, and its standard error.
+
+    Args:
+        squares: of innovations in units of their claim, NaN where none is.
+        expected: their means, as `compute_expected_squares` returns them; 1 for most filters.
+    """
+    there = ~np.isnan(squares) & ~np.isnan(expected)
+    if not there.any() or not expected[there].any():
+        return np.nan, np.nan
+    mean_expected = float(expected[there].mean())
+    ratio = float(squares[there].mean()) / mean_expected
+    # Of a ratio of means, to first order: the standard error of the mean of (square - ratio expected), over that of
+    # expected.
+    _, residual_error = average_correlated(np.where(there, squares - ratio * expected, np.nan))
+    return ratio, residual_error / mean_expected
+
+
+def scale_size_to_expected(
+    test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
+) -> MemoryTest:
+    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1."""
+    if np.all(expected == 1):
+        return test
+    there = ~np.isnan(white)
+    count = np.maximum(there.sum(axis=1), 1)  # of each row, over which both are averaged
+    squares, means = (np.where(there, numbers, 0.0).sum(axis=1) / count for numbers in (white**2, expected))
+    power, error = compute_ratio_of_squares(np.where(there.any(axis=1), squares, np.nan), means)
+    return replace(test, power=power, power_error=error)

@@ -1,0 +1,31 @@
+"""Probabilities of the modes over time, of filters that weigh modes: their figure, and its words on a page."""
+
+from collections.abc import Sequence
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from heliograph.report.figures import make_stacked_panels, place_legend_above
+from heliograph.report.innovations_section import LOOK, label_time_axis
+from heliograph.simulation.results.record import Record
+
+PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
+
+
+def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
+    """Return by name a figure of the modes at each node with a filter that weighs modes.
+
+    Its name is "modes_", `kind` and the node's number.
+    """
+    has_modes = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
+    return {f"{PREFIX}{kind}_{i}": _draw_modes(record, node) for i, node in enumerate(nodes) if has_modes[i]}
+
+
+@matplotlib.rc_context(LOOK)
+def _draw_modes(record: Record, node: str) -> Figure:
+    """Draw the probabilities of the modes over time, by the filters of one node."""
+    figure, grid = make_stacked_panels(1, 2.2, 0.8)
+    record.plot_modes(node, axes=grid[0])
+    place_legend_above(figure, grid[0], columns=3)
+    label_time_axis(record, grid[0])
+    return figure

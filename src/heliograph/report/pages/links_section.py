@@ -1,0 +1,137 @@
+"""Part of a run's report on its links: when each component arrived and when it was lost, and how often."""
+
+from collections.abc import Mapping
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.model.checks.refusals import WORDS
+from heliograph.report.arrivals import Arrivals
+from heliograph.report.figures import BLUE, VERMILION, WIDTH
+from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, name_undrawn_figures
+from heliograph.report.pages.page import Picture, Table, Text
+from heliograph.report.recording_diagnosis import Health
+from heliograph.report.sensor_output_health import round_to
+from heliograph.simulation.network import Network
+
+
+@matplotlib.rc_context(LOOK)
+def draw_deliveries(health: Health) -> Figure:
+    """Draw when each component arrived and when it was lost, a line each."""
+    links = health.links[:MOST]
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
+    axes = figure.subplots()
+    for row, link in enumerate(links):
+        lost = link.lost_times
+        arrived = link.time[link.arrived]
+        axes.plot(arrived, np.full(len(arrived), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
+        axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
+    names = [quote_for_figure(f"{link.node}: {link.component}{_format_share(link, ' ({:.0%})', '')}") for link in links]
+    axes.set_yticks(range(len(links)), names)
+    axes.set_ylim(len(links) - 0.5, -0.5)
+    axes.grid(visible=False)
+    label_time_axis(health.record, axes)
+    return figure
+
+
+def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture | Text]:
+    """Return the table of links, their figure, what was refused, and what nodes share.
+
+    Of each link: when it is due, what arrived, its longest gap, and mean and deviation of its values. `drawings`: each
+    figure as SVG.
+    """
+    unit = health.record.units.get("time", "s" if health.record.time.dtype.kind == "M" else "the unit of time")
+    explained = (
+        f"**Due**: a sender that is slower than the rows is due at its own regular intervals (in {unit}), declared or "
+        "found. One that is due in some of so many rows or intervals is so by a pattern that losses would not leave. "
+        "Where each row is a message of some node, nobody knows when another without such an interval is due. A "
+        "**gap** counts what was due and did not come."
+    )
+    needs_words = any(link.due_in != "each row" for link in health.links)
+    caption = _caption_deliveries(health)
+    picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
+    not_drawn = [f"{link.node}: {link.component}" for link in health.links[MOST:]]
+    # The column on timeouts is there if a sender has one and was silent for longer.
+    past = ["past its timeout"] if health.silences else []
+    headers = ["received", "due", "arrived", "longest gap", *past, "the network says", "mean", "std. deviation"]
+    return [
+        Table(headers, [_make_link_cells(health, link) for link in health.links], explained if needs_words else ""),
+        *picture,
+        *name_undrawn_figures(not_drawn, "Their numbers are in the table."),
+        *_list_refused(health),
+        *describe_shared_links(health.shared),
+    ]
+
+
+def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
+    """Return a link's row of the table, in the order of the headers of `make_links_blocks`."""
+    mean, deviation = _format_mean_and_deviation(link.values)
+    name = visible(f"{link.node}: {link.component}")
+    gap = "–" if link.due is None else str(link.longest_gap)
+    past: list[str] = []  # a column that is there if any sender was silent past its timeout
+    if health.silences:
+        quiet = health.silences.get(link.node)
+        past = ["–" if quiet is None else f"{len(quiet.rows)}, up to {quiet.lengths.max():g}"]
+    says = "may be lost" if link.may_be_lost else "never lost"
+    return [name, link.due_in, _format_share(link, "{:.1%}", "–"), gap, *past, says, mean, deviation]
+
+
+def _list_refused(health: Health) -> list[Table]:
+    """Return a table of what came and was refused, by reason; nothing where nothing was."""
+    rows = []
+    names = {
+        node: [link.component for link in health.links if link.node == node] for node in health.record.measurements
+    }
+    names[Network.FUSED] = [f"{link.node}: {link.component}" for link in health.links]
+    for refusal in health.record.refusals:
+        component = names[refusal.node][refusal.component]
+        name = component if refusal.node == Network.FUSED else f"{refusal.node}: {component}"
+        by = f"{refusal.node}/{refusal.filter}" if refusal.filter else refusal.node
+        rows.append([visible(name), f"{refusal.count:,}", WORDS[refusal.reason], visible(by), f"{refusal.row + 1:,}"])
+    for node, counts in health.refused_messages.items():
+        said = [(WORDS[reason].removeprefix("of "), count) for reason, count in counts.items()]
+        rows += [[visible(node), f"{count:,}", words, visible(node), "–"] for words, count in said]
+    headers = ["refused", "how many", "reason", "by", "first in row"]
+    caption = "What came and was not used: single readings, and messages as a whole, which are none of the rows."
+    return [Table(headers, rows, caption, wordy=True)] if rows else []
+
+
+def _caption_deliveries(health: Health) -> str:
+    """Return what the marks of the figure of deliveries mean: only of those that it has."""
+    arrived = any(link.arrived.any() for link in health.links)
+    lost = any(len(link.lost_times) for link in health.links)
+    if arrived and lost:
+        return "When each component arrived (blue, above) and when it did not (orange, below)."
+    if lost:
+        return "When each component did not arrive (orange)."
+    if arrived:
+        return "When each component arrived (blue, above). None is missing."
+    return "Nothing arrived, and nobody knows when it was due."
+
+
+def _format_share(link: Arrivals, form: str, unknown: str) -> str:
+    """Return the share of a link's messages that arrived, in this form; `unknown` if nobody knows what was due."""
+    return unknown if link.due is None else form.format(link.share)
+
+
+def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
+    """Return mean and standard deviation of values, each to two digits of its standard error; "–" if unknown.
+
+    For N independent values of a normal law these are s / sqrt(N) of the mean and s / sqrt(2 N) of the deviation s.
+    """
+    if len(values) < 2:
+        return (f"{values[0]:.4g}" if len(values) else "–"), "–"
+    deviation = float(values.std())
+    error = deviation / len(values) ** 0.5
+    return round_to(float(values.mean()), error), round_to(deviation, error / 2**0.5)
+
+
+def describe_shared_links(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
+    """Return what nodes share as a sentence each; nothing where their links are independent."""
+    sentences = [
+        f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
+        for name, nodes in shared.items()
+    ]
+    return [Text(sentences)] if sentences else []

@@ -1,0 +1,116 @@
+"""Part of a run's report on its predictions: what each filter expected of each row, beside what arrived."""
+
+from collections.abc import Mapping
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+import heliograph
+from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.report.figures import INK, make_stacked_panels, place_legend_above
+from heliograph.report.innovations_section import (
+    BAND,
+    COLOURS,
+    LOOK,
+    MOST,
+    choose_picture,
+    label_time_axis,
+    name_undrawn_figures,
+)
+from heliograph.report.pages.page import Picture, Section, Text
+from heliograph.report.recording_diagnosis import Health
+
+PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
+
+
+def draw_predicted_figures(health: Health) -> dict[str, Figure]:
+    """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for."""
+    figures = {
+        f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_predicting_nodes(health)[:MOST])
+    }
+    for i, (_, judged) in enumerate(_list_residuals(health)[:MOST]):
+        figures[f"residuals_{i}"] = judged.figure(health.record.time)
+    return figures
+
+
+def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of a run's page on predictions and residuals; none unless predictions were asked for.
+
+    `drawings`: each figure as SVG, by the names of `draw_predicted_figures`.
+    """
+    if not health.predicted:
+        return []
+    intro = (
+        "What each filter expected of a row, given the rows before it: also where nothing arrived. Of what arrived, "
+        "95 of 100 should lie in the band of a filter whose claim is exact."
+    )
+    nodes = _list_predicting_nodes(health)
+    pictures = {}
+    for i, node in enumerate(nodes[:MOST]):
+        if (name := f"predicted_{i}") in drawings:
+            caption = (
+                f"{visible(node)}: predictions of what arrives, with bands of {BAND:g} claimed deviations on each "
+                "side, and the data."
+            )
+            title = f"What filters of {visible(node)} predicted, and what arrived"
+            pictures[node] = Picture(drawings[name], title, caption)
+    not_drawn = [node for node in nodes if node not in pictures]
+    missing = name_undrawn_figures(not_drawn, "Their predictions are in the table of estimates.")
+    return [
+        Section("Predictions", [Text([intro]), *choose_picture(pictures), *missing]),
+        *_make_residual_sections(health, drawings),
+    ]
+
+
+def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.Residuals]]":
+    """Return ("node/filter", residuals: what it did not predict) of each filter."""
+    return [(f"{node}/{name}", one) for node, filters in health.residuals.items() for name, one in filters.items()]
+
+
+def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
+    """Return the section on residuals: what speaks against each filter's predictions, and their pictures."""
+    every = _list_residuals(health)
+    pictures = {
+        name: Picture(drawings[f"residuals_{i}"], f"Residuals of {visible(name)} over time and by size",
+                      f"{visible(name)}: in units of the claimed deviation, over time; autocorrelations with the band "
+                      "of 95 %; in order, beside the quantiles of a normal law.")
+        for i, (name, _) in enumerate(every) if f"residuals_{i}" in drawings
+    }  # fmt: skip
+    doubts = [f"{visible(name)}: {visible(line)}." for name, one in every for line in one.doubts()]
+    sentences = doubts or ["Nothing speaks against them: no correlation, no other law, no variance that changes."]
+    text = (
+        "What was not predicted: of a right model independent from row to row, normal, of variance 1. Tested, with the "
+        "number of tests in mind, by Ljung and Box, by Jarque and Bera, and by the variances of first and last third."
+    )
+    return [Section("Residuals", [Text([text]), Text(sentences), *choose_picture(pictures)])] if every else []
+
+
+def _list_predicting_nodes(health: Health) -> list[str]:
+    """Return the names of nodes with a filter that predicts what arrives."""
+    return [
+        node
+        for node, filters in health.predicted.items()
+        if any(forecast.received is not None for forecast in filters.values())
+    ]
+
+
+@matplotlib.rc_context(LOOK)
+def _draw_predicted(health: Health, node: str) -> Figure:
+    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each."""
+    record, filters = health.record, health.predicted[node]
+    laws = {name: forecast.received for name, forecast in filters.items() if forecast.received is not None}
+    names = next(iter(laws.values())).names
+    z = record.measurements.get(node)
+    data = np.concatenate(list(record.measurements.values()), axis=1) if z is None else z
+    figure, panels = make_stacked_panels(min(len(names), PANELS), 1.7, 0.8)
+    for i, panel in enumerate(panels):
+        for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
+            mean, band = law.mean[:, i], BAND * law.deviation[:, i]
+            panel.plot(record.time, mean, color=colour, linewidth=1.2, label=quote_for_figure(name))
+            panel.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+        panel.plot(record.time, data[:, i], ".", markersize=3, color=INK, label="data")
+        panel.set_ylabel(quote_for_figure(names[i]))
+    place_legend_above(figure, panels[0])
+    label_time_axis(record, panels[-1])
+    return figure
