@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from heliograph.campaign.definition import DIMENSIONS, Campaign, Setting, collect_versions, serialise_setting
-from heliograph.engine.limits import BLOCK
+from heliograph.engine.size_thresholds import BLOCK
 from heliograph.numerics.check import check_count, check_seed, fail, file_path
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")

@@ -10,4 +10,4 @@ from heliograph.cli.stop_signals import INTERRUPTED as INTERRUPTED
 from heliograph.cli.stop_signals import SIGNALLED as SIGNALLED
 from heliograph.cli.stop_signals import TERMINATED as TERMINATED
 from heliograph.cli.stop_signals import GentleStop as GentleStop
-from heliograph.numerics.process.extras import EXTRAS as EXTRAS
+from heliograph.numerics.process.optional_packages import EXTRAS as EXTRAS

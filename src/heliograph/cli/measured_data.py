@@ -197,7 +197,7 @@ def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptio
 
 def describe_unreadable_messages(path: object, events: "EventTable") -> list[str]:
     """Return lines: how many messages could not be read, why (of the first of them), and where the reading ended."""
-    from heliograph.model.checks.refusals import describe_counts
+    from heliograph.model.checks.refusal_reasons import describe_counts
 
     lines = [events.broken] if events.broken else []
     if events.refused:

@@ -202,7 +202,7 @@ def _check_output_places(
     from heliograph.disk.atomic_files import FORMATS, check_writable
     from heliograph.files.logs.vehicle_log import PACKAGES
     from heliograph.numerics.check import fail
-    from heliograph.numerics.process.extras import check_installed
+    from heliograph.numerics.process.optional_packages import check_installed
     from heliograph.report.results_folder import NEEDS
 
     endings = {path.suffix.lower() for path in (measurements, out) if isinstance(path, Path)}

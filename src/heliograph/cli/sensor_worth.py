@@ -83,7 +83,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 def _check_figure_writable(figure: Path) -> None:
     """Raise the error that writing the figure would raise."""
     from heliograph.disk.atomic_files import check_writable
-    from heliograph.numerics.process.extras import check_installed
+    from heliograph.numerics.process.optional_packages import check_installed
 
     check_installed(["matplotlib"])
     check_writable(figure, FIGURES)

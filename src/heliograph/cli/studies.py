@@ -106,7 +106,7 @@ def run_studies(
     Raises:
         ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
     """
-    from heliograph.numerics.process.extras import check_installed
+    from heliograph.numerics.process.optional_packages import check_installed
     from heliograph.report.results_folder import NEEDS
 
     known = list_studies(kind)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.export.step_parts import PartOfStep, make_parts_of_step
-from heliograph.factors.gaussian import Gaussian, from_covariance
-from heliograph.factors.two_part_mean import SplitMeanGaussian, centred_from_covariance
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance
+from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian, centred_from_covariance
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail

@@ -18,7 +18,7 @@ from heliograph.files.recording_rows import (
 from heliograph.files.table import TIME, convert_to_columns, read_rows, write_table
 from heliograph.files.table_rows import TableRows
 from heliograph.files.table_writer import predict_name_read_back
-from heliograph.model.checks.inputs import find_time_step_fault
+from heliograph.model.checks.plant_inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable

@@ -8,8 +8,8 @@ import numpy as np
 from heliograph.files.table import TIME
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail
-from heliograph.numerics.times.row_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
 from heliograph.numerics.times.row_times import find_backwards_row
+from heliograph.numerics.times.timestamp_order import SECOND, YEAR, find_out_of_order, find_unset_stamps
 from heliograph.simulation.network import Network
 
 MOST_OUT = 0.5  # share of the rows below which those that are out of order, or whose times were not set, are refused

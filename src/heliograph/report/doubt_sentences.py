@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from heliograph.report.constant_sensor_error import ConstantError
 from heliograph.report.stuck_sensors import StuckValue
-from heliograph.simulation.declared.judgement import DeclaredJudgement
+from heliograph.simulation.declared_noise.judgement import DeclaredJudgement
 from heliograph.simulation.results.whiteness import MemoryTest
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from heliograph.disk.quoted_text import visible
+from heliograph.numerics.times.dates import format_times
 from heliograph.report.figures import COLOURS, MUTED
 from heliograph.report.pages.page import Table, Text
 from heliograph.report.sensor_output_health import round_to

@@ -13,7 +13,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.pages.page import Picture, PictureChoice, Section, Table, Text
 from heliograph.report.recording_diagnosis import FilterHealth, Health
 from heliograph.report.sensor_output_health import OutputHealth, round_to
-from heliograph.simulation.declared.judgement import DeclaredJudgement
+from heliograph.simulation.declared_noise.judgement import DeclaredJudgement
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 

@@ -40,8 +40,8 @@ from heliograph.report.sensor_output_health import (
 )
 from heliograph.report.stuck_sensors import StuckValue
 from heliograph.report.wrong_time_unit import describe_wrong_time_unit
-from heliograph.simulation.declared.judgement import DeclaredJudgement, judge_declared_links
-from heliograph.simulation.description.possible import doubt_estimates
+from heliograph.simulation.declared_noise.judgement import DeclaredJudgement, judge_declared_links
+from heliograph.simulation.description.doubtful_estimates import doubt_estimates
 from heliograph.simulation.network import Network
 from heliograph.simulation.results.record import Record
 from heliograph.simulation.results.whiteness import MemoryTest, score_innovations

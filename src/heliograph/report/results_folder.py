@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from heliograph.disk.atomic_files import check_replaceable, whole_folder
-from heliograph.numerics.process.extras import check_installed
+from heliograph.numerics.process.optional_packages import check_installed
 from heliograph.report.progress import Advance, progress
 
 if TYPE_CHECKING:  # a missing extra is reported by `write_results`, in one line

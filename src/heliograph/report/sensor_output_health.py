@@ -16,8 +16,8 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.innovation import InnovationSummary, Weighed
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.estimate import STRENGTH, weakest
-from heliograph.numerics.counted_shares import average_correlated
-from heliograph.numerics.counted_shares import round_to as round_to
+from heliograph.numerics.confidence_intervals import average_correlated
+from heliograph.numerics.confidence_intervals import round_to as round_to
 from heliograph.report.expected_squared_innovations import compute_expected_squares, compute_ratio_of_squares
 from heliograph.report.innovation_medians import compute_innovation_medians
 from heliograph.report.results_folder import Json

@@ -220,15 +220,15 @@ def _find_sparse_product(equation: JaxprEqn, inputs: list[Value]) -> tuple[np.nd
     """
     dimensions, (batch, _) = equation.params["dimension_numbers"]
     tables = [_is_table(x) for x in inputs]
-    arrays = [x.get_known_numbers() if is_table_file else x for x, is_table_file in zip(inputs, tables, strict=True)]
-    if batch or not any(tables) or any(isinstance(x, InMemory) for x in arrays):
+    arrays = [x.get_known_numbers() if is_table else x for x, is_table in zip(inputs, tables, strict=True)]
+    if batch or not any(tables) or any(isinstance(x, StridedArray) for x in arrays):
         return None
     # Terms at each place along the contracted axes: entries of the one that are no zeros times those of the other.
     factors, terms = [], np.ones(1, dtype=np.int64)
-    for x, is_table_file, contracted in zip(arrays, tables, dimensions, strict=True):
+    for x, is_table, contracted in zip(arrays, tables, dimensions, strict=True):
         free = [d for d in range(x.ndim) if d not in contracted]
         rows = np.transpose(x, [*free, *contracted]).reshape(-1, math.prod(x.shape[d] for d in contracted))
-        terms = terms * (np.count_nonzero(rows, axis=0) if is_table_file else _count_data(rows, 1))
+        terms = terms * (np.count_nonzero(rows, axis=0) if is_table else _count_nonzero_entries(rows, 1))
         factors.append(rows)
     return (factors[0], factors[1]) if terms.sum() <= WRITTEN_OUT else None
 

@@ -118,8 +118,8 @@ def make_indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
     if isinstance(x, StridedArray) or places_are_known:
         return x
     flat = x.ravel().tolist()
-    has_keys, is_table_file = any(isinstance(n, RandomKey) for n in flat), all(n.op == "constant" for n in flat)
-    if has_keys or not (is_table_file or len(flat) > FEW):
+    has_keys, is_table = any(isinstance(n, RandomKey) for n in flat), all(n.op == "constant" for n in flat)
+    if has_keys or not (is_table or len(flat) > FEW):
         return x
     return put_in_memory(lowering, x)
 

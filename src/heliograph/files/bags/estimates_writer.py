@@ -12,7 +12,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.disk.atomic_files import check_writable, whole_file
-from heliograph.model.estimate import Claim, is_sound
+from heliograph.model.estimate import Claim, mask_sound_estimates
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Float

@@ -9,7 +9,7 @@ import scipy
 from scipy.special import logsumexp, ndtr
 
 from heliograph.factors.square_root_update import covariance_of_root, observe_root, roots_of
-from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.filters.filter_for_likelihood import likelihood_filter
 from heliograph.model.checks.row_times import read_row_dates
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor

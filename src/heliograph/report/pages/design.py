@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
-from heliograph.numerics.counted_shares import round_to
+from heliograph.numerics.confidence_intervals import round_to
 from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
 from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH

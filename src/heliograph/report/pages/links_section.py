@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoted_text import quote_for_figure, visible
-from heliograph.model.checks.refusals import WORDS
+from heliograph.model.checks.refusal_reasons import WORDS
 from heliograph.report.arrivals import Arrivals
 from heliograph.report.figures import BLUE, VERMILION, WIDTH
 from heliograph.report.innovations_section import LOOK, MOST, label_time_axis, name_undrawn_figures

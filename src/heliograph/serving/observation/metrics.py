@@ -8,7 +8,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from heliograph.live.event import VERDICTS
-from heliograph.model.checks.refusals import OF_NODES
+from heliograph.model.checks.refusal_reasons import OF_NODES
 from heliograph.report.sensor_output_health import summarise_output
 from heliograph.serving.observation.last_answers import LastAnswers
 from heliograph.serving.observation.watch import Watch

@@ -9,7 +9,7 @@ from heliograph.disk.quoted_text import join_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.linear.linear import LinearFilter
-from heliograph.filters.words.linear import SEEN
+from heliograph.filters.words.linear_word_filter import SEEN
 from heliograph.filters.wrappers.told_link_law import ToldFilter, believe_typical
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
