@@ -20,14 +20,14 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.engine.choice import choose_code
-from heliograph.learning.free_network import Build, describe
-from heliograph.learning.intervals import Method, estimate_long_run_covariance, quantile, sandwich
+from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
+from heliograph.learning.likelihood.parameter_transforms import unlink
 from heliograph.learning.likelihood.surface import DIFFERENCE
-from heliograph.learning.likelihood.transforms import unlink
 from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise
-from heliograph.learning.parameters import Parameters
+from heliograph.learning.long_run_covariance import Method, estimate_long_run_covariance, quantile, sandwich
+from heliograph.learning.parametric_network import Build, describe
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 
 BATCHES, BATCH, RELAYS = 10, 64, 5

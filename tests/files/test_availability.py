@@ -9,7 +9,7 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.files.sources import Sources
 from heliograph.serving import LineReader
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.device_status import LastWordsService
 from heliograph.serving.storage import Store
 

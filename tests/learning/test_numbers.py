@@ -5,7 +5,8 @@ import pytest
 from scipy import optimize
 
 import heliograph as hg
-from heliograph.learning.intervals import (
+from heliograph.learning.likelihood.trust_region import maximise
+from heliograph.learning.long_run_covariance import (
     draw_block_sums,
     estimate_by_bartlett,
     estimate_by_cosines,
@@ -13,8 +14,12 @@ from heliograph.learning.intervals import (
     find_numbers_told_by_few,
     remove_predicted_scores,
 )
-from heliograph.learning.likelihood.trust_region import maximise
-from heliograph.learning.unidentified import find_confounded, find_information_rank, format_product, format_sum
+from heliograph.learning.unidentified_directions import (
+    find_confounded,
+    find_information_rank,
+    format_product,
+    format_sum,
+)
 
 RNG = np.random.default_rng(0)
 

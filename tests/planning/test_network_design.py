@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error, paths_of
-from heliograph.planning.paths.model import compute_path_information
+from heliograph.planning.multihop_paths.model import compute_path_information
 from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, path_problem, two_hops
 
 

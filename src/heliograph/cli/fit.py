@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
-    from heliograph.learning.held_out import Change, Uniformity
-    from heliograph.learning.losses.losses import Losses
-    from heliograph.learning.losses.packet_fates import Fates
+    from heliograph.learning.held_out_comparison import Change, Uniformity
+    from heliograph.learning.packet_losses.learn_losses import Losses
+    from heliograph.learning.packet_losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
     from heliograph.report.results import Json, Results
@@ -104,7 +104,7 @@ def learn(
     from dataclasses import replace
 
     from heliograph.files.fitted import NetworkAgain
-    from heliograph.learning.held_out import compare_filters, transform_held_out
+    from heliograph.learning.held_out_comparison import compare_filters, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.pages.fit import FitResults
@@ -138,7 +138,7 @@ def learn(
 
 def _learn_lossy(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
-    from heliograph.learning.losses.losses import learn_losses
+    from heliograph.learning.packet_losses.learn_losses import learn_losses
 
     fates = _find_message_fates(network, recording)
     lossy = {name for name, sequences in fates.items() if any(0 < sequence.mean() < 1 for sequence in sequences)}
@@ -151,7 +151,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     Nodes are left out of which nobody knows when a message is due. Those are nodes without a rate of their own, where
     each row is a message of one node.
     """
-    from heliograph.learning.losses.packet_fates import fates_of_measurements, fates_of_sequence
+    from heliograph.learning.packet_losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.arrivals import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)

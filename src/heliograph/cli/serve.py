@@ -75,7 +75,7 @@ class ServeOptions:
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
         from heliograph.numerics.times.dates import horizons_in
-        from heliograph.serving.brokers.url import parse_address
+        from heliograph.serving.brokers.broker_address import parse_address
         from heliograph.serving.settings import ServiceSettings, choose_store, name_of_network, settings_of_node
         from heliograph.serving.thresholds import parse_threshold
 
@@ -112,8 +112,8 @@ class ServeOptions:
             ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.
         """
         from heliograph.numerics.check import fail
+        from heliograph.serving.brokers.broker_address import parse_address
         from heliograph.serving.brokers.state_topics import StateTopics
-        from heliograph.serving.brokers.url import parse_address
 
         if self.states is None:
             if self.discovery:
@@ -144,9 +144,9 @@ def serve(network: str | None = None, /, *, options: ServeOptions | None = None)
     import json
 
     from heliograph.numerics.check import fail
-    from heliograph.serving.assembly import run
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
+    from heliograph.serving.service_assembly import run
 
     requested = ServeOptions() if options is None else options
     # The schema needs no network.

@@ -20,7 +20,7 @@ from heliograph.files.event_columns import (
 )
 from heliograph.files.recording import Recording
 from heliograph.files.sources.reading import Reading, Unread
-from heliograph.learning.losses.delays import Delays, learn_delays
+from heliograph.learning.packet_losses.delay_law import Delays, learn_delays
 from heliograph.live.event import AHEAD, INPUTS, Event, Verdict
 from heliograph.model.checks.refusals import Reason
 from heliograph.model.plant import TIME_STEP

@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.choice import compute_once
 from heliograph.filters.filter_angles import FilterAngles
 from heliograph.forecasting.forecast import ForecastTarget, list_targets
-from heliograph.forecasting.outlook import Moments, Outlook
+from heliograph.forecasting.multistep_prediction import Moments, Outlook
 from heliograph.forecasting.scores import (
     LEVELS,
     MixtureLaws,

@@ -9,9 +9,9 @@ import numpy as np
 from heliograph.factors.gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.forecasting.forecast_result import Forecast
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead
-from heliograph.forecasting.origins import Sources, find_common_origin
-from heliograph.forecasting.outlook import (
+from heliograph.forecasting.multistep_prediction import (
     Outlook,
     find_output_claim,
     look_ahead,
@@ -19,7 +19,7 @@ from heliograph.forecasting.outlook import (
     make_outlook,
     prediction_of,
 )
-from heliograph.forecasting.prediction import Forecast
+from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.enlarged.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
 from heliograph.model.forecast_origin import Origin

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.forecasting.prediction import InputsAhead
+from heliograph.forecasting.forecast_result import InputsAhead
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.plant import TIME_STEP

@@ -10,10 +10,10 @@ from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.backtest import select_measurements
 from heliograph.forecasting.forecast import list_targets
-from heliograph.forecasting.one_step import predict_record, predict_rows
-from heliograph.forecasting.origins import origin_of
-from heliograph.forecasting.prediction import Array, Forecast
+from heliograph.forecasting.forecast_result import Array, Forecast
+from heliograph.forecasting.one_step_predictions import predict_record, predict_rows
 from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
+from heliograph.forecasting.start_states import origin_of
 from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import readable

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.learning.likelihood_maximum import Solution
+from heliograph.learning.estimate_table import Solution
 from heliograph.numerics.types import Float
 
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere

@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from heliograph.learning.arviz_inference_data import make_inference_data
+from heliograph.learning.estimate_table import Row, Solution
 from heliograph.learning.fit_sentences import describe_boundaries, describe_climb, describe_forms
-from heliograph.learning.free_network import Build, Description, describe
-from heliograph.learning.identification import Identifiability, identify_by_recording
-from heliograph.learning.inference import FitTest, Values, compare_likelihoods, information_criteria, wald_test
-from heliograph.learning.inference_data import make_inference_data
-from heliograph.learning.intervals import LEVEL, METHODS, Method
+from heliograph.learning.hypothesis_tests import FitTest, Values, compare_likelihoods, information_criteria, wald_test
+from heliograph.learning.identifiability import Identifiability, identify_by_recording
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
 from heliograph.learning.likelihood.objective import Form, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.likelihood.trust_region import Maximum
-from heliograph.learning.likelihood_maximum import Row, Solution
-from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
+from heliograph.learning.long_run_covariance import LEVEL, METHODS, Method
+from heliograph.learning.packet_losses.delay_law import Delays, DelaysByNode, learn_delays
+from heliograph.learning.parametric_network import Build, Description, describe
 from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
 from heliograph.numerics.check import check_count, check_progress, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable

@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
-from heliograph.learning.free_network import Description
-from heliograph.learning.intervals import LEVEL, find_allowed_fall
+from heliograph.learning.estimate_table import Row
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood_maximum import Row
-from heliograph.learning.losses.delays import DelaysByNode
+from heliograph.learning.long_run_covariance import LEVEL, find_allowed_fall
+from heliograph.learning.packet_losses.delay_law import DelaysByNode
+from heliograph.learning.parametric_network import Description
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float

@@ -10,12 +10,12 @@ import numpy as np
 from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
 from heliograph.live.link_counts import ScreenedEvent
-from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import FinalisedPlant, PlantState
+from heliograph.live.network_step_program import NetworkProgram
+from heliograph.live.plant_state import FinalisedPlant, PlantState
 from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
-from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, lay_side_by_side
+from heliograph.live.stuck_sensor_watch import RepeatWatch
 from heliograph.model.checks.refusals import count_by_reason
 from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import PlantState
+from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.estimate import Estimate

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from heliograph.live.long_gap import LONG, TAIL, find_factor_places, pass_long_gap
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.numerics.types import Float, PyTree
 

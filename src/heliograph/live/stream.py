@@ -10,10 +10,10 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import RARE, compile_once, find_deciding_sender
-from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
 from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
+from heliograph.live.stuck_sensor_watch import RepeatWatch
 from heliograph.model.checks.faults import find_function_fault
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason

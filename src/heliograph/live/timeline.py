@@ -10,11 +10,11 @@ import numpy as np
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
+from heliograph.live.fleet_warnings import FleetRemarks, FleetRepeatWatch
+from heliograph.live.forecast_start_of_row import estimates_by_name, judged_estimates_by_name, make_forecast_origin
 from heliograph.live.implausible_events import Candidate, FleetAngles, JudgementReader
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.network_program import shared_program
-from heliograph.live.row_origin import estimates_by_name, judged_estimates_by_name, make_forecast_origin
+from heliograph.live.network_step_program import shared_program
 from heliograph.live.sender_status import SenderStatus
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network

@@ -6,16 +6,16 @@ from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.added_signals import adds_up, design_sum_of_links
-from heliograph.planning.budget import check_budget, make_power_limits, make_unlimited
+from heliograph.planning.design_problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.error_objective import Error
-from heliograph.planning.network_of_design import BEST, COVERED
-from heliograph.planning.numbers.design import design_numbers
-from heliograph.planning.paths.design import design_paths, make_power_task
-from heliograph.planning.paths.model import Paths
-from heliograph.planning.paths.networks import paths_of
+from heliograph.planning.free_numbers.design import design_numbers
+from heliograph.planning.multihop_paths.design import design_paths, make_power_task
+from heliograph.planning.multihop_paths.model import Paths
+from heliograph.planning.multihop_paths.network_to_paths import paths_of
+from heliograph.planning.network_from_design import BEST, COVERED
 from heliograph.planning.plant_moments import measured_moment_with_one, steady_moment_with_one
-from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
+from heliograph.planning.power_budget import check_budget, make_power_limits, make_unlimited
+from heliograph.planning.sum_of_links_design import adds_up, design_sum_of_links
 from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic import (

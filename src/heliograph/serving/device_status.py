@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from heliograph.files.availability import DeviceStatuses
-from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.serving.service_loop import BatchService
 from heliograph.serving.storage.store_protocol import StoreProtocol
 
 

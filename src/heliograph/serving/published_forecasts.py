@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph
 from heliograph.live.fleet import Fleet
-from heliograph.live.row_origin import make_forecast_origin
+from heliograph.live.forecast_start_of_row import make_forecast_origin
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, show_value

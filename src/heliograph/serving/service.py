@@ -12,22 +12,22 @@ from typing import NamedTuple
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
+from heliograph.live.fleet_warnings import FleetRemarks, FleetRepeatWatch
 from heliograph.live.implausible_events import FleetAngles
-from heliograph.live.network_program import NetworkProgram as NetworkProgram
-from heliograph.live.plant import FinalisedPlant, PlantState, WithdrawnEvent
+from heliograph.live.network_step_program import NetworkProgram as NetworkProgram
+from heliograph.live.plant_state import FinalisedPlant, PlantState, WithdrawnEvent
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.process.garbage_collector import pause_collector
+from heliograph.serving.batch_intake import BatchIntake, Outcome, plant_of
 from heliograph.serving.estimate_writer import EstimateWriter, encode_line
-from heliograph.serving.intake import BatchIntake, Outcome, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.neighbour_exchange import NeighbourMessenger
 from heliograph.serving.output import Output
 from heliograph.serving.published_forecasts import ForecastPublisher, Spans
 from heliograph.serving.refusals import WHY, refuse_message, write_refusal
-from heliograph.serving.silence import SilenceWatch, find_dead_senders
+from heliograph.serving.silent_senders import SilenceWatch, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.thresholds import Thresholds
 

@@ -9,8 +9,8 @@ from heliograph.files.sources.json_field import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Options
 from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.serving.brokers.broker_address import Address
 from heliograph.serving.brokers.transport import encode_name
-from heliograph.serving.brokers.url import Address
 from heliograph.serving.published_forecasts import Spans
 from heliograph.serving.thresholds import Thresholds
 from heliograph.simulation.centres.node_filter import node_network

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.likelihood_filter import likelihood_filter
-from heliograph.learning.free_network import Build, Description
+from heliograph.learning.parametric_network import Build, Description
 from heliograph.model.channel import Channel
 from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.estimate import Innovation

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.free_parameters import Parameter
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
 from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise
 from heliograph.learning.likelihood.trust_region_step import FLAT
-from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 
 DIFFERENCE = 1e-3  # standard errors over which scores are differenced

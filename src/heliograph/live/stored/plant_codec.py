@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.live.clock_leap import Leap
 from heliograph.live.fleet import Fleet
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.plant import BeforeLeap, PlantState
+from heliograph.live.plant_state import BeforeLeap, PlantState
 from heliograph.live.sorted_rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values

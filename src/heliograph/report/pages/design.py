@@ -12,8 +12,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from heliograph.disk.quoting import quote_for_figure, visible
 from heliograph.numerics.counted_shares import round_to
-from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
-from heliograph.planning.problem import PowerDesign
+from heliograph.planning.design_comparisons import ChangeWorth, Front, SiteMap
+from heliograph.planning.design_problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.pages.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 from heliograph.report.results import Json, Results

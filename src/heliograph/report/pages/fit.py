@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.learning.estimate_table import Row
 from heliograph.learning.fitting import Fit
-from heliograph.learning.held_out import Change, Uniformity
-from heliograph.learning.likelihood_maximum import Row
-from heliograph.learning.losses.losses import Losses
+from heliograph.learning.held_out_comparison import Change, Uniformity
+from heliograph.learning.packet_losses.learn_losses import Losses
 from heliograph.report.figures import (
     AMBER,
     BLUE,

@@ -10,8 +10,8 @@ from prometheus_client.registry import Collector
 from heliograph.live.event import VERDICTS
 from heliograph.model.checks.refusals import OF_NODES
 from heliograph.report.outputs import summarise_output
-from heliograph.serving.observation.last_answers import LastAnswers
-from heliograph.serving.observation.watch import Watch
+from heliograph.serving.observation.answers_between_batches import LastAnswers
+from heliograph.serving.observation.service_watch import Watch
 
 SHOWN = 50  # plants with metrics of their own; of more the worst
 NIS = {

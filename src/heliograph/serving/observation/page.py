@@ -23,10 +23,10 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from heliograph.numerics.check import fail
-from heliograph.serving.observation.last_answers import LastAnswers
+from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.metrics import ServiceMetrics
-from heliograph.serving.observation.overview import make_plants_page
-from heliograph.serving.observation.watch import LISTED, Watch
+from heliograph.serving.observation.service_watch import LISTED, Watch
+from heliograph.serving.observation.trouble_overview import make_plants_page
 
 STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"

@@ -16,7 +16,7 @@ from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output, parse_output
 from heliograph.serving.storage.database import is_away, open_database
 from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
-from heliograph.serving.storage.tables import (
+from heliograph.serving.storage.store_tables import (
     AT_ONCE,
     CARRIED,
     IDENTITY_TABLE,
