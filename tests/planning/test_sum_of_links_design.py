@@ -90,14 +90,17 @@ def test_closed_forms_are_the_best_amplitudes(budget, options):
 def test_full_power_of_a_poor_transmitter_hurts():
     """b = (1, 1), D = diag(0.01, 10), N = 0.01; of x+ = 0.95 x + w, Var w = 0.1: 0.3696 at full power, 0.0170."""
     from heliograph.planning.sum_of_links import SummedLinks, find_amplitudes_by_formula
-    from heliograph.planning.sum_of_links_design import steady_error
+    from heliograph.planning.sum_of_links_design import steady_covariance_with_information
 
     links = SummedLinks(np.ones((2, 1)), np.diag([0.01, 10.0]), np.ones(2), 0.01, np.ones(2))
     full = links.information(np.ones(2))[0, 0]
     best = find_amplitudes_by_formula(links, np.inf, np.ones(2))
     np.testing.assert_allclose(best, [1.0, 0.002], rtol=1e-3)
     moves, noise = np.array([[0.95]]), np.array([[0.1]])
-    errors = [steady_error(moves, noise, np.array([[j]])).item() for j in (full, links.information(best)[0, 0])]
+    errors = [
+        steady_covariance_with_information(moves, noise, np.array([[j]])).item()
+        for j in (full, links.information(best)[0, 0])
+    ]
     np.testing.assert_allclose(errors, [0.3696, 0.0170], atol=6e-5)
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
-    from heliograph.learning.held_out_comparison import Change, Uniformity
+    from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
     from heliograph.learning.packet_losses.learn_losses import Losses
     from heliograph.learning.packet_losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
@@ -104,7 +104,7 @@ def learn(
     from dataclasses import replace
 
     from heliograph.files.fitted import NetworkAgain
-    from heliograph.learning.held_out_comparison import compare_filters, transform_held_out
+    from heliograph.learning.held_out_comparison import compare_before_and_after, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.pages.fit import FitResults
@@ -125,10 +125,10 @@ def learn(
     # How well the later rows were predicted before and after the fit; whether what was predicted then holds.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
-    changes: list[Change] = []
-    uniform: list[Uniformity] = []
+    changes: list[PredictionBeforeAndAfter] = []
+    uniform: list[HeldOutTransforms] = []
     if learned_rows < rows:
-        changes = stop.unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
+        changes = stop.unless_stopped(lambda: compare_before_and_after(start, fitted.network, z, u, learned_rows)) or []
     if changes:
         uniform = stop.unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
     advance("looking at losses")

@@ -1,4 +1,4 @@
-"""Noises given all data: what moved the states and what disturbed the outputs, with the rows of breaks and outliers."""
+"""Auxiliary residuals: noises of plant and sensor estimated from all data, with the rows of breaks and outliers."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -93,9 +93,9 @@ class Disturbances:
         size = np.nan_to_num(np.abs(residuals))
         p = np.minimum(2 * np.isfinite(residuals).sum() * ndtr(-size), 1.0)
         rows = _find_peaks(size.max(axis=1), p.min(axis=1) < level)
-        return [self._describe(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
+        return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
 
-    def _describe(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
+    def _make_shock(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
         """Return the shock of a row: the residual number `place` of its residuals, with its probability."""
         kind: Literal["break", "outlier"] = "outlier" if place < len(self.outputs) else "break"
         return Shock(
@@ -126,7 +126,7 @@ def disturbances(
     Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), Sections 2.12 and 4.5.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
-    plant, sensor = _find_model(filter)
+    plant, sensor = _require_linear_model(filter)
     rows, inputs = check_data(filter, z, u)
     predicted = predict_rows(filter, rows, inputs)
     if not _is_received_unchanged(predicted):
@@ -150,7 +150,7 @@ def disturbances(
     )
 
 
-def _find_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
+def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
     """Return plant and sensor of a filter for a linear Gaussian model that does not vary.
 
     Raises:
@@ -187,7 +187,11 @@ def _is_received_unchanged(predicted: Forecast) -> bool:
 def _smooth_noises(
     A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, e: np.ndarray, P: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the outputs' noise and the plant's given all data, each as means (steps, size) and covariances.
+    """Return the means of the outputs' noise and of the plant's given all data, and the covariances of these means.
+
+    The covariances tell how far a mean strays from 0 where the model is right, not how well the noise is known: each is
+    the noise's covariance less that of the noise given the data. Shapes: means (steps, size), covariances
+    (steps, size, size).
 
     Backward over the rows with r and N = Cov r, which hold what all later rows tell. At each row, with
     S = C P C' + R and K = P C' S^-1:
@@ -203,8 +207,8 @@ def _smooth_noises(
     Args:
         A: transition (n, n).
         C: matrix of the sensor (m, n).
-        Q: covariance of the plant's noise.
-        R: covariance of the sensor's noise.
+        Q: covariance of the plant's noise (n, n).
+        R: covariance of the sensor's noise (m, m).
         e: innovations (steps, m), NaN where nothing arrived.
         P: predicted covariances (steps, n, n).
     """

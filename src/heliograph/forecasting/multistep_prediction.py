@@ -1,4 +1,4 @@
-"""A filter stepped without data: its states ahead, what its sensor would measure, and what would arrive.
+"""Prediction several steps ahead without data: states, what the sensor would measure, and what would arrive.
 
 A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K parts.
 """
@@ -52,7 +52,7 @@ class Moments(NamedTuple):
     covariances: jax.Array
 
 
-class Outlook(Module):
+class MultistepPredictor(Module):
     """How a filter's states are read ahead: by its plant and sensor (None: outputs are not), and its own correction."""
 
     filter: AbstractFilter
@@ -61,7 +61,7 @@ class Outlook(Module):
     transform: AbstractTransform
     receives: bool = eqx.field(static=True)
 
-    def describe_states(self, state: PyTree) -> Moments:
+    def compute_state_moments(self, state: PyTree) -> Moments:
         """Return the moments of the states as a mixture: the filter's own if it has one, else of one part.
 
         Covariances are zero where the filter claims nothing.
@@ -131,14 +131,16 @@ class Outlook(Module):
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
         prior = self.filter.predict(state, u, k)
-        states = self.describe_states(prior)
+        states = self.compute_state_moments(prior)
         outputs = self.predict_measured(prior, states, u, k)
         # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
         received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, k)
         return prior, (states, outputs, received)
 
 
-def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
+def make_multistep_predictor(
+    filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None
+) -> MultistepPredictor:
     """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant
@@ -146,7 +148,7 @@ def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant:
     # Such a filter is told the mode in z: the zeros by which `predict_received` asks what is expected would be a mode.
     flagged = isinstance(filter, ModeObservedFilter) or (isinstance(filter, SideInformationFilter) and filter.flagged)
     transform = getattr(filter, "transform", None)
-    return Outlook(
+    return MultistepPredictor(
         filter=filter,
         plant=plant,
         sensor=believed if plant is not None else None,
@@ -156,23 +158,25 @@ def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant:
 
 
 @compile_on_call
-def _compute_moments_now(outlook: Outlook, state: PyTree) -> Moments:
+def _compute_moments_now(outlook: MultistepPredictor, state: PyTree) -> Moments:
     """Return the moments of the states at the row where the outlook begins."""
-    return outlook.describe_states(state)
+    return outlook.compute_state_moments(state)
 
 
-def look_ahead(outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray) -> tuple[Moments | None, ...]:
+def predict_moments(
+    outlook: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
+) -> tuple[Moments | None, ...]:
     """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
 
     By native code where it supports the filter. `state`: that of the filter at `step`; `u`: inputs (rows, inputs).
     """
     arguments = outlook, state, np.asarray(u, dtype=float), np.asarray(step)
-    moments: tuple[Moments | None, ...] = compute_once(_look_ahead, _by_xla, arguments)
+    moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
     return moments
 
 
-def look_ahead_of_each(
-    outlook: Outlook, state: PyTree, u: np.ndarray, step: int | np.ndarray
+def predict_moments_of_each(
+    outlook: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
 ) -> tuple[Moments | None, ...]:
     """Return the moments of several plants at each row ahead (plants, rows, K, ...), computed side by side.
 
@@ -180,7 +184,7 @@ def look_ahead_of_each(
     """
     arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
     with jax.enable_x64(True):
-        choice = choose_code(_look_ahead, (outlook, *arguments), [False, True, True, True])
+        choice = choose_code(_predict_moments, (outlook, *arguments), [False, True, True, True])
         if choice.code is not None:
             found: tuple[Moments | None, ...] = choice.results()
             return found
@@ -194,7 +198,7 @@ def look_ahead_of_each(
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)  # type: ignore[no-any-return]
 
 
-def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
+def _predict_moments(outlook: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
     """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
 
     From a state at `step`, under inputs `u` (steps, inputs).
@@ -208,15 +212,15 @@ def _look_ahead(outlook: Outlook, state: PyTree, u: jax.Array, step: jax.Array) 
     return jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)[1]
 
 
-def _look_ahead_of_each(outlook: Outlook, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
+def _predict_moments_of_each(outlook: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
     """Return the moments of each step ahead for several plants, whose states, inputs and steps have a leading axis."""
-    return jax.vmap(lambda *plant: _look_ahead(outlook, *plant))(states, u, steps)
+    return jax.vmap(lambda *plant: _predict_moments(outlook, *plant))(states, u, steps)
 
 
-_by_xla, _each_by_xla = quickly_compiled(_look_ahead), quickly_compiled(_look_ahead_of_each)
+_by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_predict_moments_of_each)
 
 
-def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
+def make_prediction(moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles) -> Prediction:
     """Return the prediction of a mixture of K Gaussians at each horizon, its angles between -pi and pi.
 
     `moments`: weights (..., horizons, K), means (..., horizons, K, m) and covariances (..., horizons, K, m, m).
@@ -244,7 +248,7 @@ def prediction_of(moments: Moments, names: tuple[str, ...], claim: Claim, angles
     )
 
 
-def find_output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
+def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Claim:
     """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most."""
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular

@@ -9,11 +9,16 @@ import numpy as np
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.filter_data import check_data
-from heliograph.forecasting.backtest import list_filtered_places, select_measurements
+from heliograph.forecasting.backtest import list_single_filters, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.forecast_result import Forecast
-from heliograph.forecasting.multistep_prediction import Outlook, find_output_claim, make_outlook, prediction_of
-from heliograph.forecasting.start_states import origin_of
+from heliograph.forecasting.multistep_prediction import (
+    MultistepPredictor,
+    find_output_claim,
+    make_multistep_predictor,
+    make_prediction,
+)
+from heliograph.forecasting.start_states import find_origin
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
@@ -46,7 +51,7 @@ def predict_rows(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    outlook = make_outlook(filter)
+    outlook = make_multistep_predictor(filter)
     sensor = first(outlook.sensor)
     names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
     return _make_forecast(outlook, np.asarray(rows), np.asarray(inputs), names)
@@ -70,18 +75,18 @@ def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | No
 
     Source: the prediction step of the filter.
     """
-    network = origin_of(instance("record", record, Record, "a Record")).model
+    network = find_origin(instance("record", record, Record, "a Record")).model
     assert isinstance(network, Network)  # nothing else makes a record with an origin
-    u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_filtered_places(network)
+    u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_single_filters(network)
     found: Forecasts = {}
-    for target in list_targets(origin_of(record)):
+    for target in list_targets(find_origin(record)):
         if (target.node, target.filter) in filtered:
             predicted = _make_forecast(target.outlook, select_measurements(target, record), u, target.received)
             found.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
     return found
 
 
-def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
+def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
     """Return the forecast of each row from those before it; z: measurements, u: inputs (rows, ...).
 
     `names`: of the numbers that arrive.
@@ -89,21 +94,21 @@ def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[
     filter, sensor = outlook.filter, first(outlook.sensor)
     states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))
     angles = filter.angles_used() or FilterAngles((), ())
-    measured = outputs and prediction_of(
+    measured = outputs and make_prediction(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, names, filter.claim, angles.received)
+    arriving = received and make_prediction(received, names, filter.claim, angles.received)
     return Forecast(
         steps=np.ones(len(z), int),
         time=np.arange(float(len(z))),
-        states=prediction_of(states, filter.states, filter.claim, angles.states),
+        states=make_prediction(states, filter.states, filter.claim, angles.states),
         outputs=measured,
         received=arriving,
         inputs="given" if filter.inputs else "none",
     )
 
 
-def _predict_each_row(outlook: Outlook, z: jax.Array, u: jax.Array) -> PyTree:
+def _predict_each_row(outlook: MultistepPredictor, z: jax.Array, u: jax.Array) -> PyTree:
     """Return the moments that a filter predicts for each row of a recording from those before it, (rows, K, ...)."""
 
     def predict_and_correct(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:

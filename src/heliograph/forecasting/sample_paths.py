@@ -1,4 +1,4 @@
-"""Paths into the future: drawn from the last estimate of one filter, through the plant with its noises."""
+"""Sample paths of the future: drawn from the last estimate of one filter, through the plant with its noises."""
 
 from typing import Any, NamedTuple
 
@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
-from heliograph.forecasting.forecast import ForecastTarget, check_covered, find_target
-from heliograph.forecasting.horizons import Horizons, Inputs, check_ahead, find_rows_ahead
-from heliograph.forecasting.start_states import origin_of
+from heliograph.forecasting.forecast import ForecastTarget, check_steps_covered, find_target
+from heliograph.forecasting.horizons import Horizons, Inputs, check_inputs_ahead, find_rows_ahead
+from heliograph.forecasting.start_states import find_origin
 from heliograph.model.forecast_origin import HasOrigin
 from heliograph.model.modes_of_motion import ModalPlant, ModalSensor, transition_over
 from heliograph.model.over_time import at, first
@@ -99,19 +99,19 @@ def draw_paths(
             is, or that claims no covariance; modes of plant or sensor of which it has no probabilities; an unknown
             start (`hg.diffuse`) of which not all has been heard.
     """
-    origin = origin_of(source)
+    origin = find_origin(source)
     target = find_target(origin, node, filter)
     ahead = find_rows_ahead(origin, target.outlook.filter.inputs, horizons, inputs)
-    check_covered(target.outlook.filter, origin.step, len(ahead.u))
-    check_ahead(target.outlook.filter.inputs, ahead, target.outlook.filter, origin.step)
+    check_steps_covered(target.outlook.filter, origin.step, len(ahead.u))
+    check_inputs_ahead(target.outlook.filter.inputs, ahead, target.outlook.filter, origin.step)
     plant, sensor = target.outlook.plant, target.outlook.sensor
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
     count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
-    starts = _draw_starts(target, count, np.random.default_rng(seed))
+    starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    x, y = _draw_from_starts(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
+    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
     return Paths(
         steps=ahead.steps,
         time=ahead.time,
@@ -122,7 +122,7 @@ def draw_paths(
     )
 
 
-class Switching(NamedTuple):
+class ModeSwitching(NamedTuple):
     """How a path's mode moves: by the filter's chain, from the first step on if the chain has `moved` before."""
 
     filter: MultipleModelFilter
@@ -147,7 +147,7 @@ class Switching(NamedTuple):
         )
 
 
-def _find_switching(target: ForecastTarget) -> Switching | None:
+def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     """Return how the modes of plant and sensor move; None where these have none."""
     filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
     if not memories((plant, sensor)):
@@ -155,10 +155,12 @@ def _find_switching(target: ForecastTarget) -> Switching | None:
     if not isinstance(filter, MultipleModelFilter):
         expected = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
         raise fail("paths of a plant or sensor with modes", expected, type(filter).__name__)
-    return Switching(filter, target.state.moved)
+    return ModeSwitching(filter, target.state.moved)
 
 
-def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _draw_initial_states(
+    target: ForecastTarget, draws: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
 
     Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none.
@@ -188,14 +190,14 @@ def _draw_starts(target: ForecastTarget, draws: int, generator: np.random.Genera
 
 
 @compile_in_float64
-def _draw_from_starts(
+def _draw_paths_from_states(
     plant: AnyPlant,
     sensor: AnySensor | None,
     starts: tuple[Array, Array],
     u: Array,
     keys: jax.Array,
     step: Array,
-    switching: Switching | None,
+    switching: ModeSwitching | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.
 

@@ -1,4 +1,4 @@
-"""Where forecasts start: the origin of a result or live object, or of several of one model side by side."""
+"""Where forecasts start: states and time of a result or live object, or of several of one model side by side."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from heliograph.numerics.types import PyTree
 Sources: TypeAlias = HasOrigin | Sequence[HasOrigin]
 
 
-def origin_of(source: object) -> Origin:
+def find_origin(source: object) -> Origin:
     """Return where a forecast from a result or live object starts: its states, and the time of its last row.
 
     Raises:
@@ -37,13 +37,13 @@ def find_common_origin(source: Sources) -> Origin:
     """Return where a forecast starts; of a list of sources their origins as one, with an axis over the sources.
 
     Raises:
-        ValueError: what `origin_of` refuses, an empty list, sources of other models or other steps.
+        ValueError: what `find_origin` refuses, an empty list, sources of other models or other steps.
     """
     if not isinstance(source, list | tuple) or hasattr(source, "origin"):
-        return origin_of(source)
+        return find_origin(source)
     if not source:
         raise fail("forecast", "at least one source", "an empty list")
-    return _stack_origins([origin_of(one) for one in source])
+    return _stack_origins([find_origin(one) for one in source])
 
 
 def _stack_origins(origins: list[Origin]) -> Origin:

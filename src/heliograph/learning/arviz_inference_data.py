@@ -45,11 +45,13 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
         raise fail("fit, to_arviz", expected, ", ".join(without_normal_law))
     covariance, _ = solution.covariance(METHOD)
     points = solution.x + random.multivariate_normal(np.zeros(len(solution.x)), covariance, draws, method="cholesky")
-    density = np.concatenate([_evaluate_rows(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)])
+    density = np.concatenate(
+        [_evaluate_row_likelihoods(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)]
+    )
     groups = {
         "posterior": _make_posterior(solution, points),
-        "log_likelihood": _list_arrived_rows(solution, density),
-        "sample_stats": _make_sums(density),
+        "log_likelihood": _select_arrived_rows(solution, density),
+        "sample_stats": _make_total_likelihood_dataset(density),
     }
     arviz = import_module("arviz")
     if hasattr(arviz, "InferenceData"):
@@ -57,7 +59,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     return import_module("xarray").DataTree.from_dict(groups)  # from version 1.0 on
 
 
-def _evaluate_rows(solution: Solution, points: np.ndarray) -> np.ndarray:
+def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndarray:
     """Return log p of each row given those before it at points of the line, (points, rows), the recordings in a row."""
     density = np.asarray(solution.surface.evaluate_rows(points).density)
     return np.concatenate([density[:, i, :steps] for i, steps in enumerate(solution.surface.data.lengths)], axis=1)
@@ -70,7 +72,7 @@ def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
     return _make_dataset({name: (("chain", "draw"), values[None, :, i]) for i, name in enumerate(names)})
 
 
-def _list_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
+def _select_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
     """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each."""
     data = solution.surface.data
     rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]
@@ -80,7 +82,7 @@ def _list_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
     return _make_dataset(content, {"recording": ("arrival", recording), "row": ("arrival", row)})
 
 
-def _make_sums(density: np.ndarray) -> "xr.Dataset":
+def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
     """Return the log-likelihood of all rows at each draw, as a dataset, from log p (draws, rows) of each row."""
     return _make_dataset({"lp": (("chain", "draw"), density.sum(axis=1)[None])})
 

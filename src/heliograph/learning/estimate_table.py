@@ -1,4 +1,4 @@
-"""Maximum of one form of the likelihood: where it is, what is at a limit or a ridge, and how well it is known.
+"""Table of estimates with intervals: of the maximum of one form of the likelihood, and what is at a limit or a ridge.
 
 The line: free numbers as unbounded coordinates, logarithms or logits of those whose domain has ends. A coordinate is
 active if its number is not at such an end. A ridge is a direction in which the likelihood does not change.
@@ -13,20 +13,20 @@ import numpy as np
 from heliograph.learning.free_parameters import Parameters, TableEntry
 from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
 from heliograph.learning.likelihood.objective import Form
-from heliograph.learning.likelihood.parameter_transforms import link, unlink, unlink_slope
+from heliograph.learning.likelihood.parameter_transforms import from_line, slope_from_line, to_line
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.long_run_covariance import (
     DRAWS,
     LEVEL,
     Method,
     Scores,
-    draw_block_sums,
+    bootstrap_block_sums,
+    compute_sandwich_covariance,
     estimate_long_run_covariance,
-    find_allowed_fall,
-    find_numbers_told_by_few,
-    quantile,
+    find_numbers_told_by_few_stretches,
+    find_profile_drop,
     remove_predicted_scores,
-    sandwich,
+    student_quantile,
 )
 from heliograph.learning.unidentified_directions import InformationRank, find_information_rank
 from heliograph.numerics.module import readable
@@ -164,19 +164,19 @@ class Solution:
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the r identified directions (`basis`); the information where it is not positive."""
         observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
-        reduced = self._reduce(observed)
+        reduced = self._project_on_identified(observed)
         least_eigenvalue = np.linalg.eigvalsh(reduced)[:1].sum()  # 0 where there is no direction
         if least_eigenvalue > 0:
             return reduced
         information = self.surface.evaluations(self.top.x[None]).information[0]
-        return self._reduce(information[np.ix_(self.active, self.active)])
+        return self._project_on_identified(information[np.ix_(self.active, self.active)])
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
         """Identified directions, in columns."""
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
-    def _reduce(self, matrix: np.ndarray) -> np.ndarray:
+    def _project_on_identified(self, matrix: np.ndarray) -> np.ndarray:
         """Return a matrix of the active coordinates along the identified directions, B' A B."""
         return np.asarray(self.basis.T @ matrix @ self.basis)
 
@@ -186,7 +186,7 @@ class Solution:
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
-            few[places] = find_numbers_told_by_few(self.surface.information_by_row(self.top.x, places))
+            few[places] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, places))
         return np.asarray(few[self.active])
 
     def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
@@ -202,8 +202,9 @@ class Solution:
             scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
         estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
         if method != "hessian":
-            estimate = estimate._replace(covariance=estimate.covariance + self._reduce(by_model))
-        return np.asarray(self.basis @ sandwich(self.hessian, estimate.covariance) @ self.basis.T), estimate.freedom
+            estimate = estimate._replace(covariance=estimate.covariance + self._project_on_identified(by_model))
+        sandwich = compute_sandwich_covariance(self.hessian, estimate.covariance)
+        return np.asarray(self.basis @ sandwich @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
         """Return the table of estimates by this form with intervals by a method, computed at the first call."""
@@ -241,8 +242,8 @@ class Solution:
         if not self.identifies(slope):
             return f"{value:>10.4g}  (not identified)"
         with np.errstate(divide="ignore"):  # of a value that rounding puts at the end of its domain
-            center = float(link(entry.domain, value))
-            half = quantile(np.inf) * error  # of the normal law: infinitely many degrees of freedom
+            center = float(to_line(entry.domain, value))
+            half = student_quantile(np.inf) * error  # of the normal law: infinitely many degrees of freedom
             row = self._make_row(entry, value, error, (center - half, center + half))
         return f"{row.value:>10}  (about {row.interval})"
 
@@ -294,22 +295,21 @@ class Solution:
             hardly_known = self.surface.domains.single[coordinate] and error > WIDE
             if hardly_known or method == "profile":
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
-                low, high = self._cut_profile(coordinate, first, find_allowed_fall(level))
+                low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            place = np.count_nonzero(self.active[:coordinate])  # of this coordinate among the active ones
-            is_told_by_few = bool(self.few[place])
-        center = float(link(entry.domain, value))
+            is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
+        center = float(to_line(entry.domain, value))
         # Blocks drawn anew say nothing of numbers of which a few stretches of the data tell all.
         if method == "bootstrap" and not is_told_by_few:
-            low, high = center + self._draw_ends(slopes, level)
+            low, high = center + self._bootstrap_interval(slopes, level)
             return low, high
-        half = quantile(freedom, level) * error
+        half = student_quantile(freedom, level) * error
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
         """Return the row of an identified number, by its standard error and both ends of its interval on the line."""
-        low, high = sorted(float(unlink(entry.domain, end)) for end in ends)
-        slope = abs(float(unlink_slope(entry.domain, link(entry.domain, value))))
+        low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
+        slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
         return Row(
             name=entry.name,
             estimate=value,
@@ -330,15 +330,14 @@ class Solution:
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
-    def _draw_ends(self, slopes: np.ndarray, level: float) -> np.ndarray:
+    def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return both ends of an interval, relative to the estimate, by sums of blocks of scores that are drawn anew.
 
         `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
         the sum.
         """
-        drawn = np.linalg.solve(self.hessian, draw_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
-        ends: np.ndarray = np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2])
-        return ends
+        drawn = np.linalg.solve(self.hessian, bootstrap_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
+        return np.asarray(np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2]))
 
     def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
         """Return the row of a number at an end of its domain: the interval is from there to where the profile fell.
@@ -347,8 +346,9 @@ class Solution:
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
-        (end,) = self._cut_profile(entry.coordinate, np.array([-outward * FURTHER]), find_allowed_fall(2 * level - 1))
-        limit = float(unlink(entry.domain, end)) if np.isfinite(end) else float(unlink(entry.domain, -outward * np.inf))
+        first, drop = np.array([-outward * FURTHER]), find_profile_drop(2 * level - 1)
+        (end,) = self._find_profile_ends(entry.coordinate, first, drop)
+        limit = float(from_line(entry.domain, end if np.isfinite(end) else -outward * np.inf))
         return Row(
             name=entry.name,
             estimate=value,
@@ -360,13 +360,13 @@ class Solution:
             identified=True,
         )
 
-    def _cut_profile(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
+    def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
         """Return where the profile of a coordinate has fallen by `drop` nats, one end for each of `first`.
 
         `first`: signed distances from the maximum at which the search for each end begins.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
-        return self.surface.find_crossings(
+        return self.surface.find_profile_crossings(
             self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
         )
 

@@ -1,4 +1,4 @@
-"""Free numbers: their places on the line that is searched, and the entries of the table that a user reads."""
+"""Free numbers as unbounded coordinates, in which a fit searches, and as the entries of a user's table."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.learning.likelihood.parameter_transforms import map_from_line, map_to_line, size, slope, unlink_slope
+from heliograph.learning.likelihood.parameter_transforms import (
+    count_coordinates,
+    map_from_line,
+    map_to_line,
+    slope_from_line,
+    slope_to_line,
+)
 from heliograph.numerics.check import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import Array, Float
@@ -29,7 +35,7 @@ class Parameter:
     @property
     def size(self) -> int:
         """Return how many coordinates it has."""
-        return size(self.domain, self.start.shape)
+        return count_coordinates(self.domain, self.start.shape)
 
     @property
     def entry_names(self) -> tuple[str, ...]:
@@ -53,7 +59,7 @@ class Parameter:
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
         """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
         if self.domain.kind == "interval":
-            return np.diag(unlink_slope(self.domain, x))
+            return np.diag(slope_from_line(self.domain, x))
         with jax.enable_x64(True):
             return np.asarray(jax.jacfwd(self._trace_entries)(jnp.asarray(x)))
 
@@ -133,7 +139,7 @@ class Parameters:
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
         """Return the free numbers at a point x (p,) of the line, {name: number}, as plain floats and arrays."""
         with jax.enable_x64(True):
-            return {name: plain_number(value) for name, value in self.values(np.asarray(x)).items()}
+            return {name: to_plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Return the values of all entries of the table (entries,) at a point x (p,) of the line."""
@@ -153,9 +159,9 @@ class Parameters:
         """Return the derivatives (entries, p) of the entries, mapped to the line by `link`, by the coordinates x."""
         pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
-            return np.stack([slope(entry.domain, value) * row for entry, value, row in pairs])
+            return np.stack([slope_to_line(entry.domain, value) * row for entry, value, row in pairs])
 
 
-def plain_number(value: Array) -> float | np.ndarray:
+def to_plain_number(value: Array) -> float | np.ndarray:
     """Return a single number as a float, several as an array."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)

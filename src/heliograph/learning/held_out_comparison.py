@@ -61,7 +61,7 @@ class Comparison(NamedTuple):
 
 @readable
 @dataclass(frozen=True)
-class Change:
+class PredictionBeforeAndAfter:
     """Filter on the held-out rows, with the numbers that the network began with and with those learned.
 
     gain: of log-likelihood per row, with its test; None where fewer than 10 rows arrived.
@@ -76,7 +76,7 @@ class Change:
 
 @readable
 @dataclass(frozen=True)
-class Uniformity:
+class HeldOutTransforms:
     """Probability integral transforms of one node's held-out rows under the learned network.
 
     by_law: whether laws of gains count in full, or as the filter's Gaussians.
@@ -89,9 +89,9 @@ class Uniformity:
     by_law: bool
 
 
-def compare_filters(
+def compare_before_and_after(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
-) -> list[Change]:
+) -> list[PredictionBeforeAndAfter]:
     """Return how each filter that claims a covariance predicts the rows from `cut` on, before and after learning.
 
     Args:
@@ -111,14 +111,18 @@ def compare_filters(
             received = ~np.all(np.isnan(old.white), axis=1)  # rows in which anything arrived
             gain = None
             if received.sum() >= LAGS:
-                gain = compare_mean((new.log_likelihood - old.log_likelihood)[received])
-            results.append(Change(node=name, filter=key, before=old, after=new, gain=gain))
+                gain = test_zero_mean((new.log_likelihood - old.log_likelihood)[received])
+            results.append(PredictionBeforeAndAfter(node=name, filter=key, before=old, after=new, gain=gain))
     return results
 
 
 def transform_held_out(
-    network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
-) -> list[Uniformity]:
+    network: Network,
+    outcome: list[PredictionBeforeAndAfter],
+    measurements: dict[str, np.ndarray],
+    inputs: np.ndarray,
+    cut: int,
+) -> list[HeldOutTransforms]:
     """Return the probability integral transforms of each node's rows from `cut` on.
 
     By the laws of its gains and noise where known, else by the Gaussian predictions of its first filter (`outcome`).
@@ -129,9 +133,9 @@ def transform_held_out(
         of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
         by_law = _transform_by_laws(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
-            uniform.append(Uniformity(name, by_law[cut:], by_law=True))
+            uniform.append(HeldOutTransforms(name, by_law[cut:], by_law=True))
         elif of_node:
-            uniform.append(Uniformity(name, np.asarray(ndtr(of_node[0].after.white)), by_law=False))
+            uniform.append(HeldOutTransforms(name, np.asarray(ndtr(of_node[0].after.white)), by_law=False))
     return uniform
 
 
@@ -177,10 +181,10 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
     received = ~np.all(np.isnan(a.pit), axis=1)
     if received.sum() < 10:
         raise fail("recording", "at least 10 steps with a measurement", int(received.sum()))
-    return compare_mean((a.log_likelihood - b.log_likelihood)[received])
+    return test_zero_mean((a.log_likelihood - b.log_likelihood)[received])
 
 
-def compare_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
+def test_zero_mean(differences: Float[np.ndarray, " steps"]) -> Comparison:
     """Return the test of whether the mean of differences (steps,), correlated over time, is zero."""
     mean, error = estimate_mean_and_error(differences)
     z = mean / error if error > 0 else 0.0

@@ -93,7 +93,7 @@ class InformationCriteria(NamedTuple):
     bic: float
 
 
-def information_criteria(log_likelihood: float, free: int, observations: int) -> InformationCriteria:
+def compute_criteria(log_likelihood: float, free: int, observations: int) -> InformationCriteria:
     """Return AIC, AICc and BIC; AICc is infinite where numbers are as many as data.
 
     Args:

@@ -9,13 +9,13 @@ import numpy as np
 
 from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.data import LikelihoodData
-from heliograph.learning.likelihood.objective import Objective, join_world, make_objectives
+from heliograph.learning.likelihood.objective import Objective, join_all_nodes, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.long_run_covariance import quantile
+from heliograph.learning.long_run_covariance import student_quantile
 from heliograph.learning.parametric_network import Build, describe
 from heliograph.learning.unidentified_directions import (
     WEAK,
-    Confounded,
+    ConfoundedNumbers,
     InformationRank,
     find_confounded,
     find_information_rank,
@@ -55,7 +55,7 @@ class Identifiability:
     """
 
     parameters: Parameters
-    groups: tuple[Confounded, ...]
+    groups: tuple[ConfoundedNumbers, ...]
     ridges: int
     weakest: float
     sentences: tuple[str, ...]
@@ -96,10 +96,10 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
     u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
-    points = _choose_points(description.parameters.start, seed)
+    points = _draw_points_near(description.parameters.start, seed)
     ranks = []
     for i, x in enumerate(points):
-        z = _draw_data(objective, x, u, check_seed("seed", seed) + i)
+        z = _draw_measurements(objective, x, u, check_seed("seed", seed) + i)
         data = LikelihoodData(measurements=z[None], inputs=u[None], lengths=(len(z),))
         ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
     return _judge_identifiability(description.parameters, points, ranks)
@@ -110,7 +110,7 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
     Points at which that is not finite are left out.
     """
-    points = _choose_points(start, seed)
+    points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
@@ -119,7 +119,7 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
     return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
 
-def _choose_points(start: np.ndarray, seed: int) -> list[np.ndarray]:
+def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
     """Return POINTS points (p,) drawn near a start (p,), within AROUND, or less of coordinates that are small."""
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
@@ -143,7 +143,9 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     `solution`: the maximum, whose estimates and intervals they have; None where there is none yet.
     """
     names = identifiability.parameters.coordinates
-    lines = [_describe_group(identifiability.parameters, group, solution) for group in identifiability.groups]
+    lines = [
+        _describe_confounded_group(identifiability.parameters, group, solution) for group in identifiability.groups
+    ]
     # Where a group has more identified combinations than products, moments of the links say more.
     has_others = any(group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups)
     if solution is not None and has_others:
@@ -156,7 +158,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     return tuple(lines)
 
 
-def _describe_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
+def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
     Such as "Of a and b only the product a * b (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a
@@ -191,7 +193,7 @@ def _count_in_words(count: int, what: str) -> str:
 
 
 def _format_interval(
-    parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
+    parameters: Parameters, group: ConfoundedNumbers, row: np.ndarray, solution: "Solution | None", log: bool
 ) -> str:
     """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum; "" if none.
 
@@ -214,7 +216,7 @@ def _format_interval(
     # g' C g is the variance of a function with the gradient g.
     covariance, freedom = solution.covariance()
     gradient = slopes[solution.active]
-    reach = quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+    reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
     middle, low, high = ((np.exp(v) if log else v) for v in (value, value - reach, value + reach))
     return f" ({middle:.3g}, 95 % {low:.3g}..{high:.3g})"
 
@@ -224,17 +226,17 @@ def _join_names(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _draw_data(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
+def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
     """Return measurements (steps, received) drawn as the filter at x (p,) expects them, with inputs u.
 
     Each row is Gaussian given those before it.
     """
     with jax.enable_x64(True):
-        return np.asarray(_draw_expected(objective, x, u, jax.random.key(seed)))
+        return np.asarray(_draw_measurements_by_innovations(objective, x, u, jax.random.key(seed)))
 
 
 @quickly_compiled
-def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
+def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before."""
     filter = objective.filter(jnp.asarray(x))
 
@@ -266,13 +268,13 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     sensor or channel varies over time, or depends on inputs or the past.
     """
     description = solution.surface.objective.description
-    _, sensor, channel = join_world(description.start)
+    _, sensor, channel = join_all_nodes(description.start)
     if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
         return []
 
     def compute_moments_at(x: Array) -> jax.Array:
         """Return mean gain, gain variance and noise of each output at a point x (p,) of the line, (outputs, 3)."""
-        _, sensor, channel = join_world(description.at(description.parameters.values(x)))
+        _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 
     with jax.enable_x64(True):
@@ -287,7 +289,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
         found = []
         for kind, value, gradient in zip(KINDS, values, gradients, strict=True):
             if solution.identifies(gradient):
-                reach = quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+                reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
                 found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")
         if found:
             lines.append(f"The received {name} has {', '.join(found)}, 95 %, the sensor's noise included.")

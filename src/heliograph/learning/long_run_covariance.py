@@ -1,4 +1,4 @@
-"""Covariances of a maximum from scores that are correlated over time, and quantiles for intervals."""
+"""Covariance of estimates from scores correlated over time (long-run, sandwich), and quantiles of intervals."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -40,7 +40,7 @@ def count_cosines(steps: int) -> int:
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
-def find_numbers_told_by_few(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
     """Return which of k numbers have their information in a few of the nu stretches of the data, (k,).
 
     `information`: of each recording that of each row on each number (steps, k). With the information V_b of stretch b,
@@ -110,7 +110,7 @@ def estimate_if_white(scores: Scores) -> LongRunCovariance:
     return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
 
 
-def draw_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
+def bootstrap_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
     """Return sums of scores over blocks of 2 T^(1/3) steps drawn with replacement, less their mean, (draws, p).
 
     Of each series of T steps about T blocks' worth of steps is drawn, and the sums of all series are added.
@@ -140,7 +140,7 @@ def estimate_long_run_covariance(
     """
     match method:
         case "bootstrap":
-            sums = draw_block_sums(scores, DRAWS, 0)
+            sums = bootstrap_block_sums(scores, DRAWS, 0)
             return LongRunCovariance(np.atleast_2d(np.cov(sums.T)), freedom=np.inf)
         case "cosines":
             return estimate_by_cosines(scores)
@@ -152,17 +152,19 @@ def estimate_long_run_covariance(
             return LongRunCovariance(hessian, freedom=np.inf)
 
 
-def quantile(freedom: float, level: float = LEVEL) -> float:
+def student_quantile(freedom: float, level: float = LEVEL) -> float:
     """Return how many standard errors an interval of this level reaches to each side: a quantile of Student's law."""
     return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
 
 
-def find_allowed_fall(level: float) -> float:
+def find_profile_drop(level: float) -> float:
     """Return by how many nats a profile likelihood is lower at the ends of an interval: half a chi-square quantile."""
     return float(scipy.stats.chi2.ppf(level, 1)) / 2
 
 
-def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def compute_sandwich_covariance(
+    hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, "p p"]:
     """Return the covariance H^-1 J H^-1 of estimates, H the Hessian of -l and J the covariance of summed scores."""
     half = np.linalg.solve(hessian, scores)
     return np.asarray(np.linalg.solve(hessian, half.T))

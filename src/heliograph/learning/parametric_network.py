@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.free_parameters import Parameter, Parameters, plain_number
+from heliograph.learning.free_parameters import Parameter, Parameters, to_plain_number
 from heliograph.learning.likelihood.parameter_transforms import map_to_line
 from heliograph.numerics.check import (
     COVARIANCE,
@@ -86,7 +86,7 @@ _reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbe
 
 
 @contextmanager
-def answering_free_by(reader: _FreeNumberReader) -> Iterator[None]:
+def answer_free_marks_by(reader: _FreeNumberReader) -> Iterator[None]:
     """Let `reader` answer all calls of `free` inside the block."""
     token = _reader.set(reader)
     try:
@@ -139,7 +139,7 @@ class FreeNumberCollector:
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
-            name = mark.given or _make_distinct(mark.place or "free number", taken)
+            name = mark.given or _make_name_distinct(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
             map_to_line(name, domain, mark.start)  # raises at a start outside of the domain
@@ -164,7 +164,7 @@ class ValueReader:
         return self.values[key]
 
 
-def _make_distinct(name: str, taken: set[str]) -> str:
+def _make_name_distinct(name: str, taken: set[str]) -> str:
     """Return a name that is not `taken`: the name itself, or with the first free number behind it."""
     if name not in taken:
         return name
@@ -192,9 +192,9 @@ class Description:
         Raises:
             ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
         """
-        with answering_free_by(ValueReader(self.parameters, self.named, values)), jax.enable_x64(True):
+        with answer_free_marks_by(ValueReader(self.parameters, self.named, values)), jax.enable_x64(True):
             try:
-                return check_network(self.build())
+                return require_network(self.build())
             except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
                 expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
                 got = f"one that is read: {error_text(error)}"
@@ -203,7 +203,7 @@ class Description:
     @cached_property
     def start(self) -> Network:
         """Network with every free number at its start."""
-        return self.at({parameter.name: plain_number(parameter.start) for parameter in self.parameters.every})
+        return self.at({parameter.name: to_plain_number(parameter.start) for parameter in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
         """Return the network, of plain numbers, at a point x (p,) of the line."""
@@ -228,8 +228,8 @@ def describe(network: Build) -> Description:
     except (TypeError, ValueError) as error:
         raise fail("network to be learned", "a function without arguments", str(error)) from None
     collector = FreeNumberCollector()
-    with answering_free_by(collector), jax.enable_x64(True):
-        check_network(network())
+    with answer_free_marks_by(collector), jax.enable_x64(True):
+        require_network(network())
     if not collector.marks:
         raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
     parameters = collector.parameters()
@@ -237,6 +237,6 @@ def describe(network: Build) -> Description:
     return Description(build=network, parameters=parameters, named=is_named)
 
 
-def check_network(network: object) -> Network:
+def require_network(network: object) -> Network:
     """Return what a function returned; raise ValueError if it is no network."""
     return instance("network to be learned", network, Network, "a function that returns a Network")

@@ -1,4 +1,4 @@
-"""Directions in which the data say nothing: from the information's rank, put in words, never inverted."""
+"""Directions in which data do not identify the free numbers: by the rank of the information, put in words."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ WHOLE = 1e-4  # how far an exponent may be from a whole number
 LARGEST = 4  # exponent that is put in words
 
 
-class Confounded(NamedTuple):
+class ConfoundedNumbers(NamedTuple):
     """Free numbers of which the data identify fewer combinations than there are numbers.
 
     places: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
@@ -62,7 +62,7 @@ def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationR
 
 def find_confounded(
     parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[InformationRank]
-) -> list[Confounded]:
+) -> list[ConfoundedNumbers]:
     """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
 
     Only points with the fewest flat directions count. The flat directions of coordinates x become those of the numbers
@@ -82,7 +82,7 @@ def find_confounded(
             slopes, log_slopes = _differentiate_coordinates(parameters, x)
             of_logs.append(_orthonormalise(log_slopes[:, None] * rank.unit[:, None] * rank.flat))
             of_numbers.append(_orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat))
-    return [_make_confounded(group, of_logs, of_numbers) for group in _group_connected(of_logs)]
+    return [_make_confounded_numbers(group, of_logs, of_numbers) for group in _group_connected_coordinates(of_logs)]
 
 
 def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
@@ -101,7 +101,7 @@ def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
     return np.asarray(left[:, size > SPANNED * max(size.max(initial=0.0), 1e-300)])
 
 
-def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
+def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     """Return the groups of coordinates that a flat direction at any point connects.
 
     `bases`: orthonormal flat directions at each point, in columns.
@@ -112,7 +112,9 @@ def _group_connected(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     return [group for group in groups if joined[group, group].any()]
 
 
-def _make_confounded(group: tuple[int, ...], of_logs: list[np.ndarray], of_numbers: list[np.ndarray]) -> Confounded:
+def _make_confounded_numbers(
+    group: tuple[int, ...], of_logs: list[np.ndarray], of_numbers: list[np.ndarray]
+) -> ConfoundedNumbers:
     """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums.
 
     Args:
@@ -123,18 +125,18 @@ def _make_confounded(group: tuple[int, ...], of_logs: list[np.ndarray], of_numbe
     places = list(group)
     unknown = int(max(np.linalg.matrix_rank(basis[places], tol=SAME) for basis in of_logs))
     no_rows = np.zeros((0, len(group)))
-    powers = _find_known_rows([basis[places] for basis in of_logs])
+    powers = _find_identified_combinations([basis[places] for basis in of_logs])
     if len(powers):
         # In each row the least exponent becomes 1.
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
         are_whole = np.all(np.abs(powers - np.round(powers)) < WHOLE)
         if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
-            return Confounded(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
-    sums = _find_known_rows([basis[places] for basis in of_numbers])
-    return Confounded(group, exponents=no_rows, weights=sums, fix=unknown)
+            return ConfoundedNumbers(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
+    sums = _find_identified_combinations([basis[places] for basis in of_numbers])
+    return ConfoundedNumbers(group, exponents=no_rows, weights=sums, fix=unknown)
 
 
-def _find_known_rows(bases: list[np.ndarray]) -> np.ndarray:
+def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
     """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
 
     `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.

@@ -80,7 +80,7 @@ class Leap(NamedTuple):
         return self.back is not None and self.back < time < self.back + self.time - time
 
 
-def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
+def find_contradicted_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
     """Return the leap that `time` contradicts by lying before it, and the newest arrival after it; None if none.
 
     A time contradicts a leap if it is later than all before the leap, but more than `most` before its far side.

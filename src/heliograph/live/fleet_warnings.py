@@ -57,4 +57,5 @@ class FleetRepeatWatch:
                     if (node, output) not in self._said:
                         self._said.add((node, output))
                         name = self._nodes[node].received_names[output]
-                        yield plant.name, f"{node}: {self._watches[node].describe(output, name, link.repeats)}"
+                        said = self._watches[node].describe_stuck_output(output, name, link.repeats)
+                        yield plant.name, f"{node}: {said}"

@@ -1,4 +1,4 @@
-"""The origin of forecasts of live plants, a row: its filters' states, the inputs held there, and its estimates."""
+"""A row of a live plant as the start of forecasts: its filters' states, the inputs held there, its estimates."""
 
 import numpy as np
 

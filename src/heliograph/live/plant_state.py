@@ -10,7 +10,7 @@ from datetime import datetime
 from math import inf
 from typing import NamedTuple, TypeAlias
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
+from heliograph.live.clock_leap import ARRIVAL, Leap, find_contradicted_leap
 from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
@@ -118,7 +118,7 @@ class PlantState:
             agreed: whether another clock says the same.
             names: names of the nodes in their order, then that of the inputs.
         """
-        found = find_leap(self.leap, self.now, time, longest_gap)
+        found = find_contradicted_leap(self.leap, self.now, time, longest_gap)
         if self.leap is None or found is None:
             return
         leap, newest = found

@@ -1,4 +1,4 @@
-"""Readings that repeat for longer than their noise allows, of sensors of which nobody said when they are stuck."""
+"""Watch for stuck sensors: readings that repeat for longer than their noise allows, where no rule says so."""
 
 from collections.abc import Sequence
 from math import ceil, inf, log
@@ -98,20 +98,21 @@ class RepeatWatch:
             found=tuple(found),
         )
 
-    def describe(self, output: int, name: str, repeats: Repeats) -> str:
-        """Return a sentence: an output repeats its newest reading for longer than its noise allows; what refuses that.
+    def describe_stuck_output(self, output: int, name: str, repeats: Repeats) -> str:
+        """Return a sentence: which output is stuck, how rare that is, and the option that refuses it.
 
         `output`: its index; `name`: what it is called; `repeats`: the runs so far.
         """
         length, value = repeats.lengths[output], repeats.newest[output]
-        before = repeats.steps[output], repeats.readings[output], repeats.equal[output]
-        count = self._count_too_many(output, length, *before)
+        count = self._count_too_many(
+            output, length, step=repeats.steps[output], readings=repeats.readings[output], equal=repeats.equal[output]
+        )
         return (
             f"{name} is stuck, or has no noise: {length} equal readings in a row ({value:g}), of which its noise makes "
             f"{count:g} less than once in {1 / SELDOM:,.0f} readings; stuck={count:g} refuses such"
         )
 
-    def _bound(self, output: int, step: float) -> float:
+    def _bound_repeat_probability(self, output: int, step: float) -> float:
         """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading."""
         key = output, step
         if key not in self._bounds:
@@ -133,5 +134,5 @@ class RepeatWatch:
         """
         # (e + 1) / (o + 2) of the pairs outside the run: e = equal - (length - 1), o = readings - length.
         by_count = (equal - (length - 1) + 1) / (readings - length + 2)
-        p = max(self._bound(output, step), by_count)
+        p = max(self._bound_repeat_probability(output, step), by_count)
         return inf if p >= 1 - SURE else max(LEAST, 1 + ceil(log(SELDOM) / log(p)))

@@ -1,4 +1,4 @@
-"""Bits of the senders' words under a total rate: for the least steady error of the best linear filter of all."""
+"""Allocation of bits to senders' words under a total rate, for the least steady error of the filter of all."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -42,7 +42,7 @@ class BitsDesign(NamedTuple):
     encoders: dict[str, Words]
 
 
-class _Senders(NamedTuple):
+class _PlantAndSenders(NamedTuple):
     """Linear plant and its senders, each of which sends one output c_i x + v_i as a word of some bits.
 
     transition, process: A and Q of the plant. rows: c_i of the sensors. information: [i, B] = j_i(B), what a word of B
@@ -75,10 +75,10 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 
     Source: Frank and Wolfe (1956), for the bound; the concave envelope of an S-shaped utility.
     """
-    senders = _describe_senders(instance("network", network, Network, "a Network"))
+    senders = _collect_plant_and_senders(instance("network", network, Network, "a Network"))
     budget, names = check_count("total bits", total), list(network.names)
-    bits = _add_greedily(senders, budget)
-    error = _find_error(senders, _take_information(senders, bits))
+    bits = _add_bits_greedily(senders, budget)
+    error = _compute_steady_error(senders, _information_of_bits(senders, bits))
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
     encoders = {
         name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")
@@ -93,7 +93,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
     )
 
 
-def _describe_senders(network: Network) -> _Senders:
+def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
     """Return plant, sensors and the information of their words of 0 to MOST bits, as arrays.
 
     Raises:
@@ -116,7 +116,7 @@ def _describe_senders(network: Network) -> _Senders:
         encoder_range = float(np.max(node.encoder.high) - np.min(node.encoder.low))
         variance = float(np.asarray(node.sensor.noise.covariance)[0, 0])
         information.append(_compute_word_information(variance, encoder_range, _find_bit_gain(name, node)))
-    return _Senders(transition=a, process=q, rows=np.array(rows), information=np.array(information))
+    return _PlantAndSenders(transition=a, process=q, rows=np.array(rows), information=np.array(information))
 
 
 def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
@@ -147,13 +147,13 @@ def _find_bit_gain(name: str, node: Node) -> float:
                type(link).__name__)  # fmt: skip
 
 
-def _take_information(senders: _Senders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
+def _information_of_bits(senders: _PlantAndSenders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
     """Return the information j_i (senders,) of each sender's word of so many bits."""
     found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
     return found
 
 
-def _find_covariance(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
+def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
     """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
     sends = j > 0
     a, q, c = senders.transition, senders.process, senders.rows[sends]
@@ -168,18 +168,18 @@ def _find_covariance(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Flo
     return symmetric
 
 
-def _find_error(senders: _Senders, j: Float[np.ndarray, " senders"]) -> float:
+def _compute_steady_error(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> float:
     """Return the trace of the steady covariance after words of this information j."""
-    return float(np.trace(_find_covariance(senders, j)))
+    return float(np.trace(_compute_steady_covariance(senders, j)))
 
 
-def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
+def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
     """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
 
     P is the covariance after the words and M = (I - K C) A = P X^-1 A moves the error of one step to the next, X being
     the covariance before the words.
     """
-    p = _find_covariance(senders, j)
+    p = _compute_steady_covariance(senders, j)
     before = senders.transition @ p @ senders.transition.T + senders.process
     m = p @ np.linalg.pinv(before) @ senders.transition
     y = solve_discrete_lyapunov(m.T, np.eye(len(m)))
@@ -188,13 +188,13 @@ def _find_slopes(senders: _Senders, j: Float[np.ndarray, " senders"]) -> Float[n
     return slopes
 
 
-def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"]:
+def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarray, " senders"]:
     """Return the bits of each sender, added where the error falls most for a bit, until `total` of them are spent.
 
     Several may be added at once to one sender; fewer are spent where none lowers the error.
     """
     bits = np.zeros(len(senders.rows), dtype=int)
-    error = _find_error(senders, _take_information(senders, bits))
+    error = _compute_steady_error(senders, _information_of_bits(senders, bits))
     while (left := total - bits.sum()) > 0:
         # (decrease of the error for each bit, sender, bits added, error then): the first counts most.
         best = (0.0, 0, 0, error)
@@ -202,7 +202,7 @@ def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"
             for more in range(1, min(left, MOST - bits[i]) + 1):
                 tried = bits.copy()
                 tried[i] += more
-                lower = _find_error(senders, _take_information(senders, tried))
+                lower = _compute_steady_error(senders, _information_of_bits(senders, tried))
                 best = max(best, ((error - lower) / more, i, more, lower))
         decrease, sender, more, error = best
         if decrease <= 0:
@@ -211,7 +211,7 @@ def _add_greedily(senders: _Senders, total: int) -> Float[np.ndarray, " senders"
     return bits
 
 
-def _bound_by_relaxation(senders: _Senders, total: int) -> float:
+def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     """Return a lower bound of the error of any bits of this total: the least of real bits with concave information.
 
     By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
@@ -220,7 +220,7 @@ def _bound_by_relaxation(senders: _Senders, total: int) -> float:
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
     for k in range(STEPS):
-        slopes, error = _find_slopes(senders, j), _find_error(senders, j)
+        slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
         best = _spend_bits(hulls, -slopes, total)
         gap = float(slopes @ (j - best))
         bound = max(bound, error - gap)

@@ -32,7 +32,7 @@ def _report_nothing(what: str) -> None:
 
 
 @readable
-class Front(NamedTuple):
+class ErrorsOverPower(NamedTuple):
     """Least errors at several total powers in rising order, and bounds below which no error is; shapes (points,).
 
     No error is above that of less power: what less power reaches, more reaches too.
@@ -43,7 +43,9 @@ class Front(NamedTuple):
     bounds: Float[np.ndarray, "points"]
 
 
-def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: Advance = _report_nothing) -> Front:
+def error_over_power(
+    problem: DesignProblem, totals: Sequence[float], advance: Advance = _report_nothing
+) -> ErrorsOverPower:
     """Return the least error at each of several total powers.
 
     Args:
@@ -68,16 +70,16 @@ def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: A
     # A design that was found for less power counts for more power too: the least error so far.
     errors = np.minimum.accumulate([best.error for best in designs])
     bounds = np.minimum([best.bound for best in designs], errors)
-    return Front(totals=powers, errors=errors, bounds=bounds)
+    return ErrorsOverPower(totals=powers, errors=errors, bounds=bounds)
 
 
-def totals_about(total: float) -> list[float]:
+def list_totals_about(total: float) -> list[float]:
     """Return POINTS total powers on both sides of this one, from a SPANth of it to SPAN times it."""
     return [float(power) for power in total * np.geomspace(1 / SPAN, SPAN, POINTS)]
 
 
 @readable
-class SiteMap(NamedTuple):
+class ErrorsOverSites(NamedTuple):
     """Errors (len(y), len(x)) at places, and the best of them."""
 
     x: Float[np.ndarray, "columns"]
@@ -97,7 +99,7 @@ def error_over_sites(
     x: "Float[ArrayLike, ' columns']",
     y: "Float[ArrayLike, ' rows']",
     advance: Advance = _report_nothing,
-) -> "SiteMap":
+) -> "ErrorsOverSites":
     """Return the least error at a design's total power where its network stands at each of several places.
 
     Args:
@@ -127,7 +129,7 @@ def error_over_sites(
             if not isinstance(network, Network):
                 raise fail("map", "a function of x and y that returns a Network", type(network).__name__)
             errors[row, column] = design(replace(problem, network=network)).error
-    return SiteMap(x=columns, y=rows, errors=errors)
+    return ErrorsOverSites(x=columns, y=rows, errors=errors)
 
 
 @readable
@@ -194,20 +196,22 @@ def _list_changes(problem: DesignProblem, network: Network, exponent: float | No
         problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)
         # The sensor left out, unless nothing is left or nothing is free then. With a target error it is not tried, as
         # that is one of all sensors.
-        still_free = None if free is None else tuple(each for each in free if _name_node(each) != name)
+        still_free = None if free is None else tuple(each for each in free if _find_node_of_transmitter(each) != name)
         if len(nodes) > 1 and still_free != () and problem.target_error is None:
             rest = {other: other_node for other, other_node in nodes.items() if other != name}
             problems[f"without {name}"] = with_nodes(rest, still_free)
         # A relay in each hop. It changes the numbers in the names of hops behind it, so that nodes are free as a whole.
         if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
-            free_nodes = None if free is None else tuple(dict.fromkeys(_name_node(each) for each in free))
+            free_nodes = (
+                None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
+            )
             for hop in transmitter_names(node.channel):
                 with_relay = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
                 problems[f"a relay halfway of {name}.{hop}"] = with_nodes({**nodes, name: with_relay}, free_nodes)
     return problems
 
 
-def _name_node(transmitter: str) -> str:
+def _find_node_of_transmitter(transmitter: str) -> str:
     """Return the name of a transmitter's node: "north" of "north.hop1"."""
     return transmitter.partition(".")[0]
 

@@ -14,7 +14,7 @@ from heliograph.planning.error_objective import Error
 from heliograph.planning.free_numbers.problem import Build
 from heliograph.planning.multihop_paths.model import Paths
 from heliograph.planning.network_from_design import designed_network
-from heliograph.planning.power_budget import Budget, check_budget
+from heliograph.planning.power_budget import Budget, make_budget
 from heliograph.simulation.network import Network
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class DesignProblem:
         Args:
             total: largest mean power of all transmitters together.
         """
-        limits = None if self.budget is None else check_budget(self.budget)
+        limits = None if self.budget is None else make_budget(self.budget)
         budget = Budget(total) if limits is None else Budget(total, limits.per_transmitter, limits.peak)
         return replace(self, budget=budget, target_error=None)
 

@@ -61,9 +61,9 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         by_step: list[AbstractRandomAffine] = []
         for k, second in enumerate(seconds):
             measured = measured_moment_with_one(node.sensor, second, k)  # E (y, 1)(y, 1)'
-            powers_of_node = _select_node(name, powers, k)
+            powers_of_node = _select_powers_of_node(name, powers, k)
             by_step.append(set_transmitter_powers(at(node.channel, k), measured, powers_of_node, k))
-        channels[name] = _make_over_time(by_step)
+        channels[name] = _join_steps_over_time(by_step)
     designed = {name: add_best_filter(plant, node, channels[name]) for name, node in nodes.items()}
     fused = {}
     if len(nodes) > 1:
@@ -113,7 +113,7 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     return Node(node.sensor, channel, filters, invalid=node.limits.invalid, timeout=node.timeout)
 
 
-def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
+def _select_powers_of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
     """Return the powers at step k of the transmitters of a node, by their names within it ("hop1").
 
     `powers`: of all transmitters, {"node.hop1": (steps,)}.
@@ -122,6 +122,6 @@ def _select_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k:
     return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
 
 
-def _make_over_time(steps: Sequence[T]) -> T | OverTime:
+def _join_steps_over_time(steps: Sequence[T]) -> T | OverTime:
     """Return the single object of one step, which then holds for ever; of several steps an OverTime."""
     return steps[0] if len(steps) == 1 else over_time(steps)

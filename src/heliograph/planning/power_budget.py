@@ -41,13 +41,13 @@ class Budget(Module):
         peak: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
     ):
         self.total = None if total is None else float(scalar("total power", total, 0.0))
-        self.per_transmitter = _check_limit("power per transmitter", per_transmitter)
-        self.peak = _check_limit("peak power", peak)
+        self.per_transmitter = _read_limit("power per transmitter", per_transmitter)
+        self.peak = _read_limit("peak power", peak)
         if self.total is None and self.per_transmitter is None and self.peak is None:
             raise fail("budget", "a total, a limit per transmitter or a peak", "none")
 
 
-def check_budget(value: object) -> Budget:
+def make_budget(value: object) -> Budget:
     """Return a budget; a plain number is one of the total power."""
     if isinstance(value, Budget):
         return value
@@ -58,7 +58,7 @@ def check_budget(value: object) -> Budget:
     return Budget(number)
 
 
-def _check_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
+def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
     """Return a checked limit of powers: a number for all transmitters, or {name: number} for some; None for none."""
     if value is None:
         return None
@@ -162,17 +162,17 @@ def make_power_limits(
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
     """
-    mean_limit = _limit_each("per_transmitter", budget.per_transmitter, names)
-    peak_limit = _limit_each("peak", budget.peak, names)
+    mean_limit = _list_limits("per_transmitter", budget.per_transmitter, names)
+    peak_limit = _list_limits("peak", budget.peak, names)
     total_limit = np.inf if budget.total is None else budget.total
     # What is not free has to be within the limits, and takes its part of the total.
     fixed = np.where(free, 0.0, powers)  # (time, hop)
     fixed_mean, fixed_peak = fixed.mean(axis=0), fixed.max(axis=0)
     for name, sent, limit in zip(names, fixed_mean, mean_limit, strict=True):
-        _check_sent(f"power of {name!r}", sent, limit)
+        _check_fixed_powers(f"power of {name!r}", sent, limit)
     for name, sent, limit in zip(names, fixed_peak, peak_limit, strict=True):
-        _check_sent(f"peak of {name!r}", sent, limit)
-    _check_sent("total", fixed_mean.sum(), total_limit)
+        _check_fixed_powers(f"peak of {name!r}", sent, limit)
+    _check_fixed_powers("total", fixed_mean.sum(), total_limit)
     return PowerLimits(
         peak=np.tile(peak_limit[free], (len(powers), 1)),
         mean=mean_limit[free],
@@ -180,14 +180,14 @@ def make_power_limits(
     )
 
 
-def _check_sent(what: str, power: float, limit: float) -> None:
+def _check_fixed_powers(what: str, power: float, limit: float) -> None:
     """Raise ValueError where transmitters that are not free send more than a limit; `what`: the limit, in words."""
     if power > limit * (1 + MET):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")
 
 
-def _limit_each(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
+def _list_limits(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
     """Return a limit for each transmitter in the order of `names`, infinite where there is none."""
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)

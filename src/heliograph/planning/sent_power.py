@@ -264,14 +264,14 @@ def _average_draws(
     """
 
     def draw_trajectory(key: jax.Array) -> dict[str, jax.Array]:
-        return _draw_squares(plant, sensors, inputs, key)
+        return _draw_output_squares(plant, sensors, inputs, key)
 
     squares: dict[str, jax.Array] = jax.vmap(jax.vmap(draw_trajectory))(keys)
     averages: dict[str, jax.Array] = jax.tree.map(lambda of_sensor: of_sensor.mean(axis=1), squares)
     return averages
 
 
-def _draw_squares(
+def _draw_output_squares(
     plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, key: jax.Array
 ) -> dict[str, jax.Array]:
     """Return (y, 1)(y, 1)' of what each sensor measures at each step of one drawn trajectory, (steps, m1, m1)."""

@@ -60,7 +60,7 @@ class DescentProblem(NamedTuple):
     restore: Callable[[Vector], Vector]
 
 
-class Programme:
+class ScaledProgramme:
     """A design problem with its limits, as a function of z = x / unit; values are divided by `size`, that of the start.
 
     The room of a limit is the part of it that is left: negative where it is exceeded.
@@ -101,7 +101,11 @@ class Programme:
         return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
 
     def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
-        """Return what each limit leaves at z as a part of it, the target's last: negative where one is exceeded."""
+        """Return the unused part of each limit at z, that of the target error last: negative where one is exceeded.
+
+        Rows of limits are scaled so that a limit is 1 (or 0), hence 1 - powers / limit; the target gives
+        1 - error / target. All are -1 at a point without an evaluation, where the error grows without limit.
+        """
         rows, most, target = self.limits.rows, self.limits.most, self.limits.target
         evaluation = self.evaluate_at(z)
         if evaluation is None:
@@ -135,11 +139,11 @@ class Programme:
         end = self._minimize(self.objective, z, constraints, tolerance)
         # Neither the start nor the end is within the limits: first back into them, then down again.
         if np.isinf(before) and not self.is_feasible(end):
-            end = self._minimize(self._excess, end, [], tolerance)
+            end = self._minimize(self._compute_squared_excess, end, [], tolerance)
             return self._minimize(self.objective, end, constraints, tolerance)
         return end if self.merit(end) < before else z
 
-    def _excess(self, z: Vector) -> tuple[float, Vector]:
+    def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:
         """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
         broken = np.minimum(self.limit_room(z), 0.0)
         return float(broken @ broken), 2 * broken @ self.limit_room_slope(z)
@@ -161,7 +165,7 @@ class Programme:
         unit = self.problem.unit
         return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
 
-    def polish(self, z: Vector) -> Vector:
+    def polish_by_newton(self, z: Vector) -> Vector:
         """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them.
 
         `z`: where a descent ended, within the limits.
@@ -175,13 +179,13 @@ class Programme:
                 break
             unit = self.problem.unit
             end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
-            before, after = (self._penalty(point, multipliers, active) for point in (z, end))
+            before, after = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
             if not (self.is_feasible(end) and after <= before * (1 + ROUNDING)):
                 break
             z = end
         return z
 
-    def _penalty(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
+    def _compute_penalised_value(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
         """Return the value plus the excess over the active limits, weighed by their multipliers."""
         excess = np.maximum(-self.limit_room(z), 0.0)
         return float(self.objective(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
@@ -245,9 +249,9 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
-        programmes = [Programme(problem, limits, sharpness, z * problem.unit) for z in points]
+        programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]
         points = [programme.descend(z, COARSE) for programme, z in zip(programmes, points, strict=True)]
-    programme = Programme(problem, limits, sharpest, points[0] * problem.unit)
+    programme = ScaledProgramme(problem, limits, sharpest, points[0] * problem.unit)
     best = min(points, key=programme.merit)
     # A fine descent from the best, begun again as long as that helps.
     for _ in range(ROUNDS):
@@ -255,4 +259,4 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
         best = programme.descend(best, FINE)
         if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
             break
-    return programme.polish(best) * problem.unit if programme.is_feasible(best) else None
+    return programme.polish_by_newton(best) * problem.unit if programme.is_feasible(best) else None

@@ -18,12 +18,12 @@ from heliograph.numerics.types import Bool, Float
 from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.network_from_design import add_best_filter
 from heliograph.planning.plant_moments import (
-    check_constant_noise,
-    check_design_plant,
     measured_moment_with_one,
+    require_constant_noise,
+    require_design_plant,
     steady_moment_with_one,
 )
-from heliograph.planning.power_budget import PowerLimits, check_budget, make_power_limits, make_unlimited
+from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
 from heliograph.planning.sum_of_links import ALIKE, HALVINGS, SummedLinks, Vector, find_amplitudes_by_formula
 from heliograph.planning.transmitters import (
     amplify_transmitter,
@@ -42,7 +42,7 @@ SEARCHES = 30  # of a power that reaches a target: to 1e-9 of it
 DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
-def adds_up(network: object) -> bool:
+def is_sum_of_links(network: object) -> bool:
     """Return whether a network is one node that receives a sum of links."""
     if not isinstance(network, Network) or network.relays is not None or network.common is not None:
         return False
@@ -50,7 +50,7 @@ def adds_up(network: object) -> bool:
     return len(nodes) == 1 and isinstance(nodes[0], Node) and isinstance(nodes[0].channel, Superposed)
 
 
-class SumTask(NamedTuple):
+class SumOfLinksTask(NamedTuple):
     """What a design of a sum of links searches: amplitudes of the free links, within limits, for a small error.
 
     An amplitude is the factor by which a link's transmitter multiplies what it measures.
@@ -159,11 +159,11 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
     """
     ((name, node),) = network.nodes.items()
     error = problem.criterion
-    assert isinstance(node, Node)  # by `adds_up`
+    assert isinstance(node, Node)  # by `is_sum_of_links`
     assert isinstance(node.channel, Superposed)
     if error.steps > 1:
         raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
-    plant, process = check_constant_noise(check_design_plant(network.plant))
+    plant, process = require_constant_noise(require_design_plant(network.plant))
     measured = np.asarray(measured_moment_with_one(node.sensor, steady_moment_with_one(plant)))  # E (y, 1)(y, 1)'
     links, unit_channel = find_links_of_sum(node, measured)
     names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
@@ -194,7 +194,7 @@ def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign
 
 def _make_task(
     problem: DesignProblem, plant: LinearPlant, process: AbstractNoise, links: SummedLinks, names: Sequence[str]
-) -> SumTask:
+) -> SumOfLinksTask:
     """Return the search: which links are free, the limits of their powers, and the error by a step's information.
 
     `names`: of the links' transmitters, in the order of the links.
@@ -203,21 +203,21 @@ def _make_task(
     limits = make_unlimited(1, int(free.sum()))
     if problem.budget is not None:
         sent = links.present**2 * links.unit
-        limits = make_power_limits(check_budget(problem.budget), names, free, sent[None])
+        limits = make_power_limits(make_budget(problem.budget), names, free, sent[None])
     transition, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
     criterion = problem.criterion.criterion(plant.states)
-    return SumTask(
+    return SumOfLinksTask(
         links=links,
         limits=limits,
         free=free,
-        covariance=lambda information: steady_error(transition, noise, information),
+        covariance=lambda information: steady_covariance_with_information(transition, noise, information),
         error=lambda covariance: criterion.exact(covariance[None]),
         starts=check_count("starts", problem.starts),
         seed=check_seed("seed", problem.seed),
     )
 
 
-def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, Certificate]:
+def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Vector, Certificate]:
     """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
     solution = task.find_amplitudes_by_formula(total)
     if solution is not None:
@@ -231,17 +231,17 @@ def _find_least_error_amplitudes(task: SumTask, total: float) -> tuple[Vector, C
     )
 
 
-def _find_least_power_amplitudes(task: SumTask, target: float) -> tuple[Vector, Certificate]:
+def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
     """Return the amplitudes (links,) of the least power that reach a target error, and the certificate.
 
     By bisection of the power of the free links, since the least error falls with it.
     """
-    best, certificate = _reach_target(task, target)
+    best, certificate = _find_amplitudes_that_reach(task, target)
     largest = float((best**2 * task.links.unit)[task.free].sum())
     low, high = 0.0, largest
     for _ in range(HALVINGS if certificate.convex else SEARCHES):
         middle = (low + high) / 2
-        tried = _try_power(task, middle, best)
+        tried = _find_best_at_power(task, middle, best)
         if task.compute_error(tried) <= target:
             high, best = middle, tried
         else:
@@ -249,11 +249,11 @@ def _find_least_power_amplitudes(task: SumTask, target: float) -> tuple[Vector, 
         if high - low <= ALIKE * largest:
             break
     needed = float((best**2 * task.links.unit).sum())
-    bound = needed if certificate.convex else _bound_power(task, target, needed)
+    bound = needed if certificate.convex else _bound_least_power(task, target, needed)
     return best, certificate._replace(value=needed, bound=bound, unit="power")
 
 
-def _try_power(task: SumTask, power: float, near: Vector) -> Vector:
+def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vector:
     """Return the best amplitudes at a power of the free links: by formula, else by one descent from `near`."""
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
@@ -261,7 +261,7 @@ def _try_power(task: SumTask, power: float, near: Vector) -> Vector:
     return task.search_amplitudes(power, 1, near) if solution is None else solution
 
 
-def _bound_power(task: SumTask, target: float, needed: float) -> float:
+def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> float:
     """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
 
     By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
@@ -273,7 +273,7 @@ def _bound_power(task: SumTask, target: float, needed: float) -> float:
     return low + task.fixed
 
 
-def _reach_target(task: SumTask, target: float) -> tuple[Vector, Certificate]:
+def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
     """Return amplitudes that reach a target error: with all power within the limits, or doubled where none limits.
 
     Raises:
@@ -307,7 +307,7 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     Raises:
         ValueError: a sensor or a sum that the formulas do not cover.
     """
-    sensor, channel = _check_sum(node)
+    sensor, channel = _require_plain_sum(node)
     # The sum in which each transmitter sends what it measures (an amplification of None).
     unit = channel
     for hop in transmitter_names(channel):
@@ -338,27 +338,27 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
     return links, unit
 
 
-def _check_sum(node: Node) -> tuple[LinearSensor, Superposed]:
+def _require_plain_sum(node: Node) -> tuple[LinearSensor, Superposed]:
     """Return the sensor and the sum of a node; ValueError where a design has no formulas for them."""
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
-        raise _unfit("a sensor that varies, is not linear or has angles")
+        raise _make_no_formula_error("a sensor that varies, is not linear or has angles")
     assert isinstance(channel, Superposed)
     if channel.outputs > 1 or channel.past or channel.remembers or channel.corner_count() > 1:
-        raise _unfit("several outputs, delays, memory or uncertain probabilities")
+        raise _make_no_formula_error("several outputs, delays, memory or uncertain probabilities")
     counts = [len(transmitter_names(link)) for link in channel.maps]
     if any(count != 1 for count in counts) or any(link.inputs > 1 for link in channel.maps):
-        raise _unfit(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
+        raise _make_no_formula_error(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
     return sensor, channel
 
 
-def _unfit(got: str) -> ValueError:
+def _make_no_formula_error(got: str) -> ValueError:
     """Return the error that names a sum for which there are no formulas."""
     expected = "links of one known hop each, for one number (else give a function of free numbers)"
     return fail("design of a sum of links", expected, got)
 
 
-def steady_error(
+def steady_covariance_with_information(
     matrix: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "n n"]:
     """Return the steady covariance after each step of a filter of x+ = A x + w that receives this information in each.

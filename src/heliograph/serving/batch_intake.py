@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap, make_first_leap
+from heliograph.live.clock_leap import ARRIVAL, Leap, find_contradicted_leap, make_first_leap
 from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
-from heliograph.live.implausible_events import Candidate, JudgementReader
+from heliograph.live.implausible_events import CandidateEvent, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.plant_state import PlantState, WithdrawnEvent
 from heliograph.numerics.check import InputError
 from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
 
 
-class Outcome(NamedTuple):
+class MessageOutcome(NamedTuple):
     """What became of a message.
 
     Attributes:
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     notes: Sequence[str] = ()
 
 
-class PlantBefore(NamedTuple):
+class PlantBeforeBatch(NamedTuple):
     """State of a plant before a batch.
 
     Attributes:
@@ -77,24 +77,24 @@ class BatchIntake:
         # Why something is refused, by the number of its message and whether it is the message's inputs.
         self._refused: dict[tuple[int, bool], str] = {}
         # Of the present round: plants as they were, by name, and the events that they used, to be judged.
-        self._before: dict[str, PlantBefore] = {}
-        self._taken: list[Candidate] = []
+        self._before: dict[str, PlantBeforeBatch] = {}
+        self._taken: list[CandidateEvent] = []
         self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
         self.replaced: list[tuple[PlantState, list[WithdrawnEvent]]] = []  # these as they were, with their events
 
-    def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[Outcome]:
+    def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[MessageOutcome]:
         """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
 
         `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
         had never arrived.
         """
         self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
-        outcomes = [Outcome()] * len(messages)
+        outcomes = [MessageOutcome()] * len(messages)
         # One plant after another, so that its memory is near; the messages of a plant in their order. Those that could
         # not be read have no plant, and stand under "".
         numbers_by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
-            name = plant_of(message)
+            name = find_plant_name(message)
             if name is None or name not in damaged:
                 numbers_by_plant.setdefault(name or "", []).append(i)
         waiting = [i for numbers in numbers_by_plant.values() for i in numbers]
@@ -104,7 +104,7 @@ class BatchIntake:
             for i in waiting:
                 outcomes[i] = self._take_message(i, messages[i], wall)
             restored = self._refuse_implausible()
-            waiting = [i for i in waiting if plant_of(messages[i]) in restored]
+            waiting = [i for i in waiting if find_plant_name(messages[i]) in restored]
         self._taken = []
         return outcomes
 
@@ -120,16 +120,16 @@ class BatchIntake:
             self._restore_plant(name)
         return restored
 
-    def _take_message(self, number: int, message: Read, wall: datetime) -> Outcome:
+    def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
         """Give a message to its plant, as far as it was read; return its outcome."""
         if isinstance(message, str):
-            return Outcome(why=message)
+            return MessageOutcome(why=message)
         if isinstance(message, UnreadMessage):
-            return Outcome(self._count_unread(message), why=message.why)
+            return MessageOutcome(self._count_unread(message), why=message.why)
         try:
             return self._use_message(number, message, wall)
         except InputError as error:  # of another kind than its plant expects
-            return Outcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
+            return MessageOutcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
 
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return {(number of a message, True): why its inputs lead to no valid prediction}, as `_refused` has it.
@@ -148,7 +148,7 @@ class BatchIntake:
         reasons = self._judges.explain_implausible_inputs(plants, np.array(inputs, dtype=np.float64))
         return {(i, True): why for i, why in zip(numbers, reasons, strict=True) if why}
 
-    def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> Outcome:
+    def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> MessageOutcome:
         """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
 
         `number`: of the message in the batch. `wall`: the time by this machine's clock.
@@ -165,15 +165,15 @@ class BatchIntake:
         # A new plant begins with a message that is plausible and of a right clock.
         if plant is None:
             if timed.at > timed.arrival + self.fleet.options.ahead:
-                return Outcome(verdict="future")
+                return MessageOutcome(verdict="future")
             nothing_is_plausible = why and (timed.inputs is None or why_inputs)
             if nothing_is_plausible:
-                return Outcome(verdict="implausible", why=why)
+                return MessageOutcome(verdict="implausible", why=why)
             # Its first moment counts as a leap in time, by one clock that may be wrong: that of arrivals where given.
             has_arrival = message.arrival is not None
             leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
             plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
-        plant = self._note_before(plant, timed.at)
+        plant = self._note_plant_before_batch(plant, timed.at)
         # Inputs and measurement are used or refused independently.
         notes = self._use_inputs(number, plant, message, timed, why_inputs)
         verdict: Verdict = "implausible"
@@ -182,7 +182,7 @@ class BatchIntake:
         self.fleet.count_event(plant, message.node, screened, verdict)
         if screened.why and verdict == "used":
             notes.append(f"{screened.why}; the rest is used")
-        return Outcome(plant, verdict, why, notes)
+        return MessageOutcome(plant, verdict, why, notes)
 
     def _use_inputs(
         self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
@@ -226,24 +226,24 @@ class BatchIntake:
             at = self._time_as_number(message.time, plant.origin, plant.name)
         except InputError:  # a time of another kind
             return None
-        link = self._note_before(plant, at).link_counts(node)
+        link = self._note_plant_before_batch(plant, at).link_counts(node)
         if unread.counted:
             link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
         if unread.reason is not None:
             link.count_refused(unread.reason)
         return plant
 
-    def _note_before(self, plant: PlantState, begun: float) -> PlantState:
+    def _note_plant_before_batch(self, plant: PlantState, begun: float) -> PlantState:
         """Return the plant, and note once in a batch what it was before, for `_restore_plant`; a new one is added.
 
         `begun`: time of the first event of a new plant.
         """
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
-            self._before[plant.name] = PlantBefore(known=False, clock=(begun, None), links={})
+            self._before[plant.name] = PlantBeforeBatch(known=False, clock=(begun, None), links={})
         elif plant.name not in self._before:
             links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
-            self._before[plant.name] = PlantBefore(known=True, clock=plant.clock, links=links)
+            self._before[plant.name] = PlantBeforeBatch(known=True, clock=plant.clock, links=links)
         return plant
 
     def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
@@ -267,7 +267,7 @@ class BatchIntake:
         if message.arrival is not None:
             clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
         # The leap with which the plant began: the message takes that back if it goes on from before.
-        first, newest = find_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
+        first, newest = find_contradicted_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
         began_with_it = first is not None and first.now == -inf and not plant.holds_rows_before(first, at, longest_gap)
         if first is not None and began_with_it and first.is_taken_back_by(clock, clock_time, newest):
             return None
@@ -314,7 +314,7 @@ class BatchIntake:
         verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
         if verdict == "used":
             row, _ = plant.changes[-1]  # that which holds it now
-            self._taken.append(Candidate(number, plant, event, row))
+            self._taken.append(CandidateEvent(number, plant, event, row))
         return verdict
 
     def _restore_plant(self, name: str) -> None:
@@ -335,7 +335,7 @@ class BatchIntake:
         return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
 
 
-def plant_of(message: Read) -> str | None:
+def find_plant_name(message: Read) -> str | None:
     """Return the name of the plant of a message; None of one that names none."""
     if isinstance(message, str):
         return None

@@ -1,4 +1,4 @@
-"""Last words of devices, online or offline, kept in the store with the state of the plants."""
+"""Status of devices, online or offline, by their last words, kept in the store with the state of the plants."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from heliograph.serving.service_loop import BatchService
 from heliograph.serving.storage.store_protocol import StoreProtocol
 
 
-class LastWordsService:
+class DeviceStatusService:
     """A service that keeps the last words of devices: a device that was offline is so after a restart.
 
     Args:

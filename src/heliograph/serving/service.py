@@ -20,13 +20,13 @@ from heliograph.live.sorted_rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.process.garbage_collector import pause_collector
-from heliograph.serving.batch_intake import BatchIntake, Outcome, plant_of
+from heliograph.serving.batch_intake import BatchIntake, MessageOutcome, find_plant_name
 from heliograph.serving.estimate_writer import EstimateWriter, encode_line
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.neighbour_exchange import NeighbourMessenger
 from heliograph.serving.output import Output
 from heliograph.serving.published_forecasts import ForecastPublisher, Spans
-from heliograph.serving.refusals import WHY, refuse_message, write_refusal
+from heliograph.serving.refusals import WHY, make_refusal_entry, make_refusal_of_message
 from heliograph.serving.silent_senders import SilenceWatch, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.thresholds import Thresholds
@@ -170,7 +170,7 @@ class Service:
         """Use a batch of payloads and return the outputs to publish; note its statistics in `last`."""
         begun = perf_counter()
         messages = read_messages(payloads)
-        names = {name for message in messages if (name := plant_of(message)) is not None}
+        names = {name for message in messages if (name := find_plant_name(message)) is not None}
         self._load_plants(names)
         # If another process has committed one of the plants, read it again and repeat.
         while True:
@@ -265,7 +265,7 @@ class Service:
                 self._doubt(f"warning: plant {name!r}, {line}")
 
     def _report_unused(
-        self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[Outcome]
+        self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[MessageOutcome]
     ) -> tuple[list[Entry], int, int]:
         """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
 
@@ -277,29 +277,29 @@ class Service:
             if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
             # Of a plant that is damaged in the store; a text is a message that could not be read, of no known plant.
-            damage = self._damage.get(plant_of(message) or "")
+            damage = self._damage.get(find_plant_name(message) or "")
             if damage and not isinstance(message, str):
-                entries.append(refuse_message(message, "damaged", damage))
+                entries.append(make_refusal_of_message(message, "damaged", damage))
                 continue
             # Not read, or of another kind than its plant expects.
             if isinstance(message, str | UnreadMessage) or outcome.verdict is None:
                 malformed += 1
                 is_explained = isinstance(payload, str | UnreadMessage)  # by who read it: then it need not be shown
                 why = outcome.why if is_explained else f"{outcome.why}: {show_value(payload)}"
-                entries.append(refuse_message(message, "malformed", why))
+                entries.append(make_refusal_of_message(message, "malformed", why))
                 continue
             known += outcome.verdict in ("duplicate", "late")
             entries += self._explain_refusal(message, outcome)
         return entries, malformed, known
 
-    def _explain_refusal(self, message: AnyMessage, outcome: Outcome) -> list[Entry]:
+    def _explain_refusal(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
 
         `outcome` has a verdict other than "used", or notes on parts of the message.
         """
-        entries = [refuse_message(message, "implausible", note) for note in outcome.notes]
+        entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":
-            entries.insert(0, refuse_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
+            entries.insert(0, make_refusal_of_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
         if outcome.verdict == "implausible" or outcome.notes:
             self._warn(message, outcome.why or outcome.notes[0])
         return entries
@@ -367,7 +367,7 @@ class Service:
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
-            yield write_refusal(plant.name, parts, "future", LEAPT)
+            yield make_refusal_entry(plant.name, parts, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""

@@ -19,7 +19,7 @@ from heliograph.serving.brokers.line_reader import LineReader, redirected_file
 from heliograph.serving.brokers.pipe import Pipe
 from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.transport import LOG, WHOLE, Part, TakenOverError, Transport
-from heliograph.serving.device_status import LastWordsService
+from heliograph.serving.device_status import DeviceStatusService
 from heliograph.serving.service import Service
 from heliograph.serving.service_loop import (
     AbandonedError,
@@ -29,7 +29,13 @@ from heliograph.serving.service_loop import (
     set_stop_on_signals,
 )
 from heliograph.serving.settings import NOTHING, SHORTEST, ServiceSettings
-from heliograph.serving.storage.store_protocol import AwayError, InMemoryStore, StoreProtocol, identity, report_damage
+from heliograph.serving.storage.store_protocol import (
+    AwayError,
+    InMemoryStore,
+    StoreProtocol,
+    describe_damaged_plants,
+    identity,
+)
 from heliograph.serving.waiting_service import WaitingService, retry_while_away
 from heliograph.simulation.network import Network
 
@@ -94,7 +100,7 @@ class PartLeases(Protocol):
 
 
 @dataclass
-class _Part:
+class _ServedPart:
     """A part that is being served, and the event that ends it."""
 
     work: asyncio.Task[None]
@@ -114,7 +120,7 @@ async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
     free after a term; whoever takes one over first publishes what was committed and not published.
     """
     stop = asyncio.Event()
-    parts: dict[int, _Part] = {}
+    parts: dict[int, _ServedPart] = {}
     with set_stop_on_signals(stop):
         try:
             while not stop.is_set():
@@ -127,7 +133,7 @@ async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
                 await asyncio.to_thread(leases.leave)
 
 
-async def _serve_exactly(parts: dict[int, _Part], leases: PartLeases, serve: Serve) -> None:
+async def _serve_exactly(parts: dict[int, _ServedPart], leases: PartLeases, serve: Serve) -> None:
     """Start and stop services so that `parts`, by number those that are served, are exactly the leased ones."""
     _drop_ended(parts)
     try:
@@ -144,10 +150,10 @@ async def _serve_exactly(parts: dict[int, _Part], leases: PartLeases, serve: Ser
     # Start the new ones.
     for number in sorted(leased - parts.keys()):
         stop = asyncio.Event()
-        parts[number] = _Part(asyncio.ensure_future(serve(number, stop)), stop)
+        parts[number] = _ServedPart(asyncio.ensure_future(serve(number, stop)), stop)
 
 
-def _drop_ended(parts: dict[int, _Part]) -> None:
+def _drop_ended(parts: dict[int, _ServedPart]) -> None:
     """Remove the parts whose service ended by itself; raise what it failed with, unless another process took it."""
     for number, part in list(parts.items()):
         if part.work.done():
@@ -158,10 +164,10 @@ def _drop_ended(parts: dict[int, _Part]) -> None:
                 LOG.warning("%s", error)
 
 
-async def run(settings: ServiceSettings) -> None:
+async def run_service(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
     _log_to_stderr()
-    async with _watching(settings) as wrap:
+    async with _serve_watch_page(settings) as wrap:
         program = await _compile_steps(settings.network)
         if program is None:
             return
@@ -198,7 +204,7 @@ WrapService = Callable[[Service], BatchService]
 
 
 @asynccontextmanager
-async def _watching(settings: ServiceSettings) -> AsyncIterator[WrapService]:
+async def _serve_watch_page(settings: ServiceSettings) -> AsyncIterator[WrapService]:
     """Serve the page for a block, if there is one, and yield what wraps a service so that the page shows it."""
     if settings.page is None:
         yield lambda service: service
@@ -226,7 +232,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
         # The store first, whose state the service goes on from.
         store = await asyncio.to_thread(retry_while_away, lambda: _open_store(settings, fleet, owning), stop)
         has_plants = store.count() > 0
-        service = Service(fleet, store, _say, settings.every, settings.forecast, settings.thresholds)
+        service = Service(fleet, store, _print_to_stderr, settings.every, settings.forecast, settings.thresholds)
         try:
             service.resume()
             transport = _open_transport(settings, reader)
@@ -234,18 +240,18 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
             shown = (
                 wrap(service)
                 if reader is None
-                else LastWordsService(wrap(service), reader.sources.device_statuses, store)
+                else DeviceStatusService(wrap(service), reader.sources.device_statuses, store)
             )
             await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:
             store.close()
     # What was not used, in words.
     for line in [] if reader is None else reader.left_out():
-        _say(line)
+        _print_to_stderr(line)
     # A store may have used the same messages in an earlier run: say so, as nothing else shows it.
     if has_plants and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
-        _say(f"{service.known} messages were known already or came after what was final; {anew}")
+        _print_to_stderr(f"{service.known} messages were known already or came after what was final; {anew}")
 
 
 def _choose_patience(fleet: Fleet) -> float | None:
@@ -299,19 +305,21 @@ def _open_store(settings: ServiceSettings, fleet: Fleet, owning: contextlib.Exit
 
     # Plants of another network are carried over where that is allowed.
     mine = identity(fleet)
-    migration = PlantMigration(fleet, mine, _say) if settings.accept_changes else None
+    migration = PlantMigration(fleet, mine, _print_to_stderr) if settings.accept_changes else None
     store = Store(settings.store, mine, settings.process, carrier=migration)
     if settings.snapshot is not None:
         store.begin_from(settings.snapshot, mine, migration)
     store.begin_anew(settings.anew)
     # Its state, in words.
     if store.damaged:
-        _say(f"store {store.name}: {report_damage(store.damaged)}")
-    _say(f"the state is kept in {store.name}, plants so far: {store.count()} (--store {NOTHING} keeps nothing)")
+        _print_to_stderr(f"store {store.name}: {describe_damaged_plants(store.damaged)}")
+    _print_to_stderr(
+        f"the state is kept in {store.name}, plants so far: {store.count()} (--store {NOTHING} keeps nothing)"
+    )
     return store
 
 
-def _say(what: str) -> None:
+def _print_to_stderr(what: str) -> None:
     """Print a line to the standard error."""
     print(f"heliograph: {what}", file=sys.stderr)
 
@@ -361,7 +369,7 @@ async def _serve_part(
     # The journal of a part continues with whichever process serves it.
     store = Store(str(settings.store), identity(fleet), f"part {part.number} of {part.of}", opened=checked)
     try:
-        service = wrap(Service(fleet, store, _say, None, settings.forecast, settings.thresholds))
+        service = wrap(Service(fleet, store, _print_to_stderr, None, settings.forecast, settings.thresholds))
         # Processes that share plants do not step them through silence; that a sender has timed out is published all the
         # same, where there are timeouts.
         patience = SHORTEST if fleet.shortest_timeout < inf and not fleet.deciding else None

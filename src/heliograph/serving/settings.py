@@ -102,7 +102,7 @@ class ServiceSettings:
             raise fail("--parts", "messages in our own form, which name their part", "sources in the network's file")
 
 
-def choose_store(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
+def choose_store_location(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
     """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
 
     None keeps no state. Processes that share `parts` have no such default, and must all name the store.

@@ -122,9 +122,9 @@ class SilenceWatch:
     def select_for_publication(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
         """Return the rows whose estimates differ from what was published, or which are due again."""
         outputs = self.fleet.outputs([row.slot for _, row in rows])
-        return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_news(*pair, output)]
+        return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_worth_publishing(*pair, output)]
 
-    def _is_news(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
+    def _is_worth_publishing(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
         """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved."""
         published = self._published.get(plant.name)
         if published is None or published.dead != self._dead_senders(plant):

@@ -89,7 +89,7 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
         case GaussianFilter() | OpenLoop():
             return _rescale_gaussian(filter, units)
         case LinearFilter():
-            return replace(_rescale_ends(filter, units), channel=_rescale_moments(filter.channel, units))
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_moments(filter.channel, units))
         case MixtureFilter():
             components = _rescale_combinations(filter.components, units)
             return replace(filter, plant=rescale_plant(filter.plant, units), components=components)
@@ -99,11 +99,13 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
             inner = _rescale_system(filter.inner, filter.degree, units)
             return PolynomialFilter(inner, filter.degree, filter.endless, _rescale_centre(filter.centre, units))
         case ModalFilter() | UncertainModalFilter():
-            return replace(_rescale_ends(filter, units), channel=_rescale_by_mode(filter.channel, units))
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_by_mode(filter.channel, units))
         case AdditiveModalFilter():
-            return replace(_rescale_ends(filter, units), terms=tuple(_rescale_by_mode(t, units) for t in filter.terms))
+            return replace(
+                _rescale_plant_and_sensor(filter, units), terms=tuple(_rescale_by_mode(t, units) for t in filter.terms)
+            )
         case SideInformationFilter(flagged=False) | MultipleModelFilter():
-            return replace(_rescale_ends(filter, units), channel=_rescale_by_mode(filter.channel, units))
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_by_mode(filter.channel, units))
         case PredictionFilter():
             return PredictionFilter(_require_gaussian(rescale_filter(filter.base, units)))
         case SequentialFilter():
@@ -112,7 +114,7 @@ def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
             raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
 
 
-def _rescale_ends(filter: Ended, units: Units) -> Ended:
+def _rescale_plant_and_sensor(filter: Ended, units: Units) -> Ended:
     """Return the filter with its plant and its sensor in other units, what is between them as it was."""
     return replace(filter, plant=rescale_plant(filter.plant, units), sensor=rescale_sensor(filter.sensor, units))
 
@@ -240,7 +242,7 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
 
     It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
     """
-    q, (_, factor) = units.received, _scale_channel(units)
+    q, (_, factor) = units.received, _list_channel_factors(units)
 
     def scaled(quadratic: QuadraticMap) -> QuadraticMap:
         """Return second moments of (G, n) in the other units."""
@@ -252,7 +254,7 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
 
 
-def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
+def _list_channel_factors(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
     """Return the factors of M = (G, n), element ia, and of its second moments E[M_ia M_jb], element ijab."""
     q, r = units.received, np.append(units.outputs, 1.0)
     return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
@@ -261,7 +263,7 @@ def _scale_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.nd
 def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of a channel z = G y + n by mode in other units: z = Q G R^-1 y + Q n in each."""
     values: Modes = stacked(channel)
-    of_mean, of_spread = _scale_channel(units)
+    of_mean, of_spread = _list_channel_factors(units)
     noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread
     scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)

@@ -55,7 +55,7 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         z = first @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             expected = channel.moments(order).expect(evaluate_monomials(y, order))
-            worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_rows(z, order)))
+            worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_monomials(z, order)))
     return worst
 
 
@@ -98,11 +98,11 @@ def _compare_modes(
     }
     for order, (at_first, at_second) in by_mode.items():
         first, second = initial @ at_first, initial @ transition @ at_second
-        worst = max(worst, _compare_means(f"order {order}, first draw", first, _evaluate_rows(now, order)))
-        worst = max(worst, _compare_means(f"order {order}, second draw", second, _evaluate_rows(later, order)))
+        worst = max(worst, _compare_means(f"order {order}, first draw", first, _evaluate_monomials(now, order)))
+        worst = max(worst, _compare_means(f"order {order}, second draw", second, _evaluate_monomials(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", initial, transition, by_mode[i][0], by_mode[j][1]).reshape(-1)
-        seen = np.einsum("sm,sl->sml", _evaluate_rows(now, i), _evaluate_rows(later, j)).reshape(len(now), -1)
+        seen = np.einsum("sm,sl->sml", _evaluate_monomials(now, i), _evaluate_monomials(later, j)).reshape(len(now), -1)
         worst = max(worst, _compare_means(f"orders {i} and {j} of two draws in a row", expected, seen))
     return worst
 
@@ -146,7 +146,7 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
     return drawn, np.asarray(h_2)
 
 
-def _evaluate_rows(z: np.ndarray, order: int) -> np.ndarray:
+def _evaluate_monomials(z: np.ndarray, order: int) -> np.ndarray:
     """Return the monomials of an order of (z, 1), of each row of z (samples, outputs), as (samples, monomials)."""
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])

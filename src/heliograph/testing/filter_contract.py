@@ -61,7 +61,7 @@ def _check_step(filter: AbstractFilter, state: PyTree, z: np.ndarray, u: np.ndar
         AssertionError: naming the rule that is broken.
     """
     arguments = filter, state, z, u, np.asarray(k)
-    once, again = (compute_once(_step_each_way, _step_each_way_by_xla, arguments) for _ in range(2))
+    once, again = (compute_once(_list_ways_to_step, _list_ways_to_step_by_xla, arguments) for _ in range(2))
     (stepped, estimate), (corrected, estimate_of_parts, innovation), means_in_vmap = once
     (_, estimate_again), *_ = again
     is_same = np.array_equal(estimate.mean, estimate_again.mean)
@@ -78,7 +78,7 @@ def _check_step(filter: AbstractFilter, state: PyTree, z: np.ndarray, u: np.ndar
     return stepped, float(innovation.log_likelihood)
 
 
-def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
+def _step_filter(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     """Return state and estimate after a step."""
     return filter.step(state, z, u, k)
 
@@ -97,16 +97,16 @@ def _step_in_vmap(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k
     return jax.vmap(lambda s, z: filter.step(s, z, u, k)[1].mean)(*twice)
 
 
-def _step_each_way(*arguments: PyTree) -> tuple[PyTree, ...]:
+def _list_ways_to_step(*arguments: PyTree) -> tuple[PyTree, ...]:
     """Return the step in each of three ways; native code computes once what they have in common."""
-    return _step(*arguments), _predict_and_correct(*arguments), _step_in_vmap(*arguments)
+    return _step_filter(*arguments), _predict_and_correct(*arguments), _step_in_vmap(*arguments)
 
 
 # By XLA three programs: one of all three is more than thrice as much work for its optimiser.
-_ways_by_xla = tuple(map(compile_in_float64, (_step, _predict_and_correct, _step_in_vmap)))
+_ways_by_xla = tuple(map(compile_in_float64, (_step_filter, _predict_and_correct, _step_in_vmap)))
 
 
-def _step_each_way_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
+def _list_ways_to_step_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
     """Return the step in each of three ways, each compiled by itself."""
     return tuple(way(*arguments) for way in _ways_by_xla)
 

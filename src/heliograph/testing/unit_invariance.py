@@ -212,13 +212,13 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
         off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
     filters = {f: rescale_filter(filter, units) for f, filter in node.filters.items()}
-    return Node(rescale_sensor(node.sensor, units), _change_units(node.channel, units), filters)
+    return Node(rescale_sensor(node.sensor, units), _change_units_of_channel(node.channel, units), filters)
 
 
-def _change_units(channel: Channel, units: Units) -> Channel:
+def _change_units_of_channel(channel: Channel, units: Units) -> Channel:
     """Return the channel that maps R y to Q z, where this one maps y to z."""
     if isinstance(channel, OverTime):
-        return over_time([_change_units(step, units) for step in unstack(channel)])
+        return over_time([_change_units_of_channel(step, units) for step in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 

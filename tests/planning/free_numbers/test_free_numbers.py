@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.free_numbers.problem import NumberProblem, check_free_numbers
+from heliograph.planning.free_numbers.problem import FreeNumberProblem, make_free_numbers
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
@@ -74,7 +74,7 @@ def check_gradients(problem, relative=2e-3):
 @cache
 def problem_of(name):
     build, free = CASES[name]
-    return NumberProblem(build, check_free_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
+    return FreeNumberProblem(build, make_free_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
 
 
 @pytest.fixture(scope="module", params=CASES)

@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.free_numbers.problem import NumberProblem, check_free_numbers
+from heliograph.planning.free_numbers.problem import FreeNumberProblem, make_free_numbers
 from tests.planning.free_numbers.test_free_numbers import (
     CASES,
     FADING,
@@ -46,7 +46,7 @@ UNSTABLE = hg.LinearPlant([[1.2, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), [1.0, 2
     ],
 )
 def test_gradients_of_every_error_are_those_of_differences(build, free, error):
-    check_gradients(NumberProblem(build, check_free_numbers(free), error))
+    check_gradients(FreeNumberProblem(build, make_free_numbers(free), error))
 
 
 @pytest.mark.parametrize(

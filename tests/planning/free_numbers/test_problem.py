@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.free_numbers.problem import NumberProblem, check_free_numbers, read_free_numbers
+from heliograph.planning.free_numbers.problem import FreeNumberProblem, make_free_numbers, read_free_numbers
 
 PLANT = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0)
 OUTSIDE = {"noise": 0.3}
@@ -21,7 +21,7 @@ def marks():
 
 
 def problem(start=1.2, build=one_hop, **error):
-    return NumberProblem(build, check_free_numbers({"amplification": (start, 0.1, 5.0)}), Error(**error))
+    return FreeNumberProblem(build, make_free_numbers({"amplification": (start, 0.1, 5.0)}), Error(**error))
 
 
 def test_budgets_and_weights_are_no_reason_to_compile_again():
@@ -29,7 +29,7 @@ def test_budgets_and_weights_are_no_reason_to_compile_again():
 
 
 def test_marks_are_the_same_each_time():
-    first, again = (NumberProblem(*read_free_numbers(marks, None), Error()) for _ in range(2))
+    first, again = (FreeNumberProblem(*read_free_numbers(marks, None), Error()) for _ in range(2))
     assert first._slopes is again._slopes
 
 

@@ -9,15 +9,15 @@ from .multistart import MaximumSearch as MaximumSearch
 from .multistart import SPREAD as SPREAD
 from .objective import Form as Form
 from .objective import Objective as Objective
-from .objective import join_world as join_world
+from .objective import join_all_nodes as join_all_nodes
 from .objective import make_objectives as make_objectives
-from .parameter_transforms import link as link
+from .parameter_transforms import count_coordinates as count_coordinates
+from .parameter_transforms import from_line as from_line
 from .parameter_transforms import map_from_line as map_from_line
 from .parameter_transforms import map_to_line as map_to_line
-from .parameter_transforms import size as size
-from .parameter_transforms import slope as slope
-from .parameter_transforms import unlink as unlink
-from .parameter_transforms import unlink_slope as unlink_slope
+from .parameter_transforms import slope_from_line as slope_from_line
+from .parameter_transforms import slope_to_line as slope_to_line
+from .parameter_transforms import to_line as to_line
 from .predictive_density import ChannelDensities as ChannelDensities
 from .predictive_density import NODES as NODES
 from .predictive_density import Predictive as Predictive
@@ -25,4 +25,4 @@ from .predictive_density import evaluate_predictive as evaluate_predictive
 from .predictive_density import make_signal_filter as make_signal_filter
 from .predictive_density import predictive as predictive
 from .surface import LikelihoodSurface as LikelihoodSurface
-from .trust_region import Maximum as Maximum
+from .trust_region import ClimbEnds as ClimbEnds

@@ -1,4 +1,4 @@
-"""Transforms of a number on its domain to numbers on the whole line, where steps are taken, and back."""
+"""Transforms of free numbers on their domains to unbounded coordinates (logarithms, logits), and back."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> F
         return np.asarray(factor[np.tril_indices(len(value))])
     if np.any(value <= domain.low) or np.any(value >= domain.high):
         raise fail(f"start of {name}", f"a start {_describe_domain(domain)}", value.tolist())
-    return np.asarray(link(domain, value)).reshape(-1)
+    return np.asarray(to_line(domain, value)).reshape(-1)
 
 
 def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
@@ -68,7 +68,7 @@ def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
     return weights / jnp.sum(weights, axis=-1, keepdims=True)
 
 
-def link(domain: Domain, value: PyTree) -> PyTree:
+def to_line(domain: Domain, value: PyTree) -> PyTree:
     """Return a number of an interval on the line: as logit, logarithm or itself, by the ends that the interval has."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
@@ -77,8 +77,8 @@ def link(domain: Domain, value: PyTree) -> PyTree:
     return np.log(domain.high - value) if np.isfinite(domain.high) else value
 
 
-def unlink(domain: Domain, value: PyTree) -> PyTree:
-    """Return the number of the interval that `link` maps to this value; of infinite values an end of the interval."""
+def from_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the number of the interval that `to_line` maps to this value; an end of it for infinite values."""
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -87,8 +87,8 @@ def unlink(domain: Domain, value: PyTree) -> PyTree:
         return domain.high - np.exp(value) if np.isfinite(domain.high) else value
 
 
-def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `unlink` at a value of the line."""
+def slope_from_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `from_line` at a value of the line."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -96,8 +96,8 @@ def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
     return -np.exp(value) if np.isfinite(domain.high) else np.ones_like(value)
 
 
-def slope(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `link` at a number of the interval."""
+def slope_to_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `to_line` at a number of the interval."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -105,7 +105,7 @@ def slope(domain: Domain, value: PyTree) -> PyTree:
     return -1 / (domain.high - value) if np.isfinite(domain.high) else np.ones_like(value)
 
 
-def size(domain: Domain, shape: tuple[int, ...]) -> int:
+def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
     """Return how many coordinates on the line a number of this domain and shape has."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":

@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.learning.packet_losses.loss_laws import AbstractLossLaw, Packets
 from heliograph.learning.packet_losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, keep_ends_only
-from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_shares
+from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_over_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -55,7 +55,7 @@ class HiddenModeLosses(AbstractLossLaw):
             value_of_ends, gradient_of_ends = ends.likelihood(x)
             return value - value_of_ends, gradient - gradient_of_ends
 
-        top, value = maximise_shares(likelihood, [*STARTS])
+        top, value = maximise_over_shares(likelihood, [*STARTS])
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:  # the good mode is the one that loses less
             good, bad, fails, recovers = bad, good, recovers, fails
@@ -163,7 +163,7 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _rescale(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm (...)."""
     rows = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
     size = np.maximum(rows[..., 0], rows[..., 1])
@@ -179,15 +179,15 @@ def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray
     """
     shape = (len(matrix), len(lengths))
     power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
-    scale, (square, square_scale) = np.zeros(shape), _rescale(matrix)
+    scale, (square, square_scale) = np.zeros(shape), _rescale_matrices(matrix)
     digits = lengths.copy()
     while np.any(digits):
         odd = (digits & 1).astype(bool)  # lengths that have this binary digit
         power = np.where(odd[:, None, None], square[:, None] @ power, power)
-        power, more = _rescale(power)
+        power, more = _rescale_matrices(power)
         scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
         digits = digits >> 1
-        square, more = _rescale(square @ square)
+        square, more = _rescale_matrices(square @ square)
         square_scale = 2 * square_scale + more
     return power, scale
 
@@ -201,6 +201,6 @@ def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     while parts.shape[1] > 1:
         if parts.shape[1] % 2:
             parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
-        parts, more = _rescale(parts[:, 1::2] @ parts[:, ::2])
+        parts, more = _rescale_matrices(parts[:, 1::2] @ parts[:, ::2])
         scale = scale + more.sum(axis=1)
     return parts[:, 0], scale

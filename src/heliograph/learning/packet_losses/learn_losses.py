@@ -10,8 +10,8 @@ from scipy.special import expit, xlogy
 from heliograph.learning.long_run_covariance import estimate_mean_and_error
 from heliograph.learning.packet_losses.hidden_mode_losses import HiddenModeLosses
 from heliograph.learning.packet_losses.loss_laws import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
-from heliograph.learning.packet_losses.packet_fates import CheckedFates, Fates, check_fates, fill_ends, is_trial
-from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_shares
+from heliograph.learning.packet_losses.packet_fates import CheckedFates, Fates, check_fates, fill_ends, find_trials
+from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_over_shares
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -77,7 +77,7 @@ class LossMemory(NamedTuple):
         excess, variance = 0.0, 0.0
         for stretch in check_fates(fates):
             # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
-            for lost in _split_at_unknown(np.where(is_trial(stretch), stretch, np.nan)):
+            for lost in _split_at_unknown(np.where(find_trials(stretch), stretch, np.nan)):
                 n, losses = len(lost), float(lost.sum())
                 pairs = 2 * losses * (n - losses)  # 2 n1 n0
                 runs = 1 + np.sum(np.diff(lost) != 0)
@@ -141,7 +141,7 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
     share = float(scalar("held-out share", held_out, 0.0, 1.0))
     if share == 1.0:
         raise fail("held-out share", "less than 1: something must be fitted", share)
-    known = is_trial(np.concatenate(parts))
+    known = find_trials(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
     held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
     laws = _fit_laws(parts, intervals=True)
@@ -249,7 +249,7 @@ class RunningRateLosses(AbstractLossLaw):
             ValueError: what is no fates.
         """
         parts = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
-        trials, parts = [is_trial(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
+        trials, parts = [find_trials(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
@@ -261,7 +261,7 @@ class RunningRateLosses(AbstractLossLaw):
                 total, gradient = total + value, gradient + slope
             return total, gradient * share * (1 - share)
 
-        top, value = maximise_shares(likelihood, [*STARTS])
+        top, value = maximise_over_shares(likelihood, [*STARTS])
         return RunningRateLosses(*estimate_shares(likelihood, top, value, intervals))
 
     def shares(self) -> dict[str, Share]:

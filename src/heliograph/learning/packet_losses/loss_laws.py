@@ -4,8 +4,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from heliograph.learning.packet_losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, is_trial
-from heliograph.learning.packet_losses.probability_intervals import estimate_shares, logits, maximise_shares
+from heliograph.learning.packet_losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, find_trials
+from heliograph.learning.packet_losses.probability_intervals import estimate_shares, logits, maximise_over_shares
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
@@ -64,7 +64,7 @@ class AbstractLossLaw(Module):
         """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
-            logs: Packets = np.where(is_trial(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
+            logs: Packets = np.where(find_trials(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
         if fate[-1] == CHOSEN and len(fate) > 2:
             logs[-1] = np.log1p(-p[-1]) - np.log(self._compute_return_probability(len(fate) - 1))
         return logs
@@ -95,7 +95,7 @@ class IndependentLosses(AbstractLossLaw):
             ValueError: what is no fates.
         """
         known = np.concatenate(check_fates(fates))
-        return IndependentLosses(int(np.sum(known == 1)), int(np.sum(is_trial(known))))
+        return IndependentLosses(int(np.sum(known == 1)), int(np.sum(find_trials(known))))
 
     def shares(self) -> dict[str, Share]:
         """Return the share of losses, lost / packets, with Wilson's interval."""
@@ -142,7 +142,7 @@ class MarkovLosses(AbstractLossLaw):
             past, length = _number_last_fates(fill_ends(stretch), order)
             # Of order 1 the chain is taken given its end, so that the step to the end counts as well. A past that comes
             # several times is counted each time.
-            counted = (length == order) & (~np.isnan(stretch) if order == 1 else is_trial(stretch))
+            counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
         spans = _measure_spans(stretches)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
@@ -226,7 +226,7 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
         intervals: whether the intervals of the two probabilities are computed too.
     """
     likelihood = _LikelihoodBetweenEnds(counts, spans).evaluate
-    top, value = maximise_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    top, value = maximise_over_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
     # Variances of the logits: the diagonal of the Hessian's inverse, by central differences of the gradient. Over this
     # width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
     width = 1e-4

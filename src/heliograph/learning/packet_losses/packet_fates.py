@@ -46,7 +46,7 @@ class BetweenArrivals(np.ndarray):
         return marked
 
 
-def is_trial(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
+def find_trials(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
     """Return which packets are trials: those whose fate is known, and that are no ends chosen for having arrived."""
     return np.asarray((fate == 0) | (fate == 1))
 
@@ -251,9 +251,11 @@ def check_fates(value: object) -> Fates:
             )
     chosen = [getattr(stretch, "chosen", False) for stretch in stretches]
     fates = CheckedFates(
-        _mark_ends(fate) if is_chosen else fate for fate, is_chosen in zip(parts, chosen, strict=True) if len(fate)
+        _mark_chosen_ends(fate) if is_chosen else fate
+        for fate, is_chosen in zip(parts, chosen, strict=True)
+        if len(fate)
     )
-    if not any(np.any(is_trial(fate)) for fate in fates):
+    if not any(np.any(find_trials(fate)) for fate in fates):
         raise fail("fates", "at least one packet of which the fate is known and that is no end of its stretch", "none")
     return fates
 
@@ -266,7 +268,7 @@ def _list_stretches(value: object) -> list[Any]:
     return members if are_stretches else [value]
 
 
-def _mark_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+def _mark_chosen_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
     """Return the fates (packets,) with CHOSEN for the first and the last."""
     ends = np.zeros(len(fate), dtype=bool)
     ends[[0, -1]] = True

@@ -20,7 +20,7 @@ PROFILE_ACCURACY = 1e-9  # relative, of a log-likelihood on a profile
 LogLikelihood = Callable[[np.ndarray], tuple[float, np.ndarray]]  # logits (p,) -> its value and gradient (p,)
 
 
-def maximise_shares(
+def maximise_over_shares(
     function: LogLikelihood, starts: list[np.ndarray], precision: float = 1e-13
 ) -> tuple[np.ndarray, float]:
     """Return the highest point of a function of logits (p,), within END, by climbs from several starts; and its value.
@@ -57,15 +57,15 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
     # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
-    low = 0.0 if is_zero else _find_crossing(function, top, level, i, -1)
-    high = 1.0 if is_one else _find_crossing(function, top, level, i, 1)
+    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, -1)
+    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, 1)
     estimate = float(expit(top[i]))
     if is_zero or is_one:
         estimate = 0.0 if is_zero else 1.0
     return Share(estimate, low, high)
 
 
-def _find_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: int, side: int) -> float:
+def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: int, side: int) -> float:
     """Return the share i at which its profile crosses a level, below (side -1) or above (1) the share of the maximum.
 
     The profile at a logit is the log-likelihood, largest over all other logits. 0 or 1 is returned where it stays above
@@ -85,7 +85,7 @@ def _find_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: in
     def height_above_level(logit_of_share: float) -> float:
         """Return how far the profile at this logit is above the level."""
         nonlocal nearby
-        best_others, profile = maximise_shares(
+        best_others, profile = maximise_over_shares(
             _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
         )
         if profile > level:

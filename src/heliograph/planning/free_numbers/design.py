@@ -8,14 +8,14 @@ from scipy.optimize import nnls
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
 from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.free_numbers.problem import Build, NumberProblem, read_free_numbers
+from heliograph.planning.free_numbers.problem import Build, FreeNumberProblem, read_free_numbers
 from heliograph.planning.network_from_design import repeat_network
-from heliograph.planning.power_budget import PowerLimits, check_budget, make_power_limits, make_unlimited
+from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
 from heliograph.planning.sequential_quadratic_programming import (
     ACTIVE,
     DescentProblem,
     PowerAndErrorLimits,
-    Programme,
+    ScaledProgramme,
     Vector,
     search_from_starts,
 )
@@ -40,7 +40,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         ValueError: no start from which a budget or a target error is met, a network that does not fit the error.
     """
     starts, seed = check_count("starts", task.starts), check_seed("seed", task.seed)
-    problem = NumberProblem(*read_free_numbers(build, task.free), task.criterion)
+    problem = FreeNumberProblem(*read_free_numbers(build, task.free), task.criterion)
     target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
     if target == 0:
         raise fail("target error", "a number above zero", "0")
@@ -48,16 +48,16 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     present = problem.solve_at(problem.numbers.start)
     problem.check_ends()
     # The best of descents from the start, and from points that are drawn.
-    limits = _make_limit_rows(_limit_powers(problem, task.budget), target)
+    limits = _make_limit_rows(_limit_all_powers(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     points = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
     descent = problem.descent_problem()
     best = search_from_starts(descent, limits, points)
     if best is None:
-        raise _explain_unmet(descent, limits, points)
+        raise _make_unmet_limits_error(descent, limits, points)
     # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound. With a
     # target what was minimised is the power, else the error.
-    found, conditions = problem.solve_at(best), check_lagrange_conditions(descent, limits, best)
+    found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
@@ -78,12 +78,12 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     )
 
 
-def _limit_powers(problem: NumberProblem, budget: object) -> PowerLimits:
+def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits:
     """Return the limits that a budget sets to the powers of all transmitters (steps, hops); none without a budget."""
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
-    limits = make_power_limits(check_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
+    limits = make_power_limits(make_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return limits
@@ -106,7 +106,7 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
     )
 
 
-def _explain_unmet(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
+def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
     `begin`: the starts that were tried. A programme's `size` is its value at its start, here the least that was found.
@@ -117,25 +117,25 @@ def _explain_unmet(problem: DescentProblem, limits: PowerAndErrorLimits, begin: 
         no_target = limits._replace(target=None)
         best = search_from_starts(problem, no_target, begin)
         if best is not None:
-            error = Programme(problem, no_target, sharpest, best).size
+            error = ScaledProgramme(problem, no_target, sharpest, best).size
             return fail(
                 "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
             )
     # Else it is the power: the least total without limits of it (a target of infinity makes the power the value).
     no_limit = PowerAndErrorLimits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
     best = search_from_starts(problem, no_limit, begin)
-    power = np.inf if best is None else Programme(problem, no_limit, sharpest, best).size
+    power = np.inf if best is None else ScaledProgramme(problem, no_limit, sharpest, best).size
     expected = f"one that is met from some of {starts} starts (a total power of {power:.6g} is the least found)"
     return fail("budget", expected, "none that is")
 
 
-def check_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
+def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
     """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
     The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
     """
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
-    programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
+    programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.objective(z)
     # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
     reached = programme.limit_room(z) < ACTIVE

@@ -92,7 +92,7 @@ class FreeNumbers(NamedTuple):
         return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
 
 
-def check_free_numbers(free: object) -> FreeNumbers:
+def make_free_numbers(free: object) -> FreeNumbers:
     """Return the free numbers of {name: (start, low, high)}; a start may be an array, ends numbers or of its shape.
 
     Raises:
@@ -104,7 +104,7 @@ def check_free_numbers(free: object) -> FreeNumbers:
         if len(parts) != 3:
             raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
         start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
-        low, high = (_check_end(name, end, start.shape) for end in parts[1:])
+        low, high = (_read_range_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
         numbers[name] = FreeNumber(start, low, high)
@@ -115,7 +115,7 @@ def check_free_numbers(free: object) -> FreeNumbers:
     return FreeNumbers(numbers)
 
 
-def _check_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
+def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return a least or largest value, which may be infinite, of the start's shape."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)
@@ -138,7 +138,7 @@ def read_free_numbers(build: Build, free: object) -> tuple[Build, FreeNumbers]:
     except TypeError as error:
         raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
     if free is not None:
-        return build, check_free_numbers(free)
+        return build, make_free_numbers(free)
     description = describe(build)
     marks = {}
     for mark in description.parameters.every:
@@ -183,13 +183,13 @@ class TracedNetwork:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, TracedNetwork) and are_same(
-            (self.build, self.start, self._shape()), (other.build, other.start, other._shape())
+            (self.build, self.start, self._list_array_shapes()), (other.build, other.start, other._list_array_shapes())
         )
 
     def __hash__(self) -> int:
-        return hash(self._shape())
+        return hash(self._list_array_shapes())
 
-    def _shape(self) -> tuple[object, ...]:
+    def _list_array_shapes(self) -> tuple[object, ...]:
         """Return what the shapes of a program's arrays depend on."""
         shapes = tuple((name, number.start.shape) for name, number in self.numbers.by_name.items())
         return shapes, self.error.steps, self.error.horizon is None, self.young
@@ -249,7 +249,7 @@ class EvaluatedPoint(NamedTuple):
         return np.asarray(self.system.powers)
 
 
-class NumberProblem:
+class FreeNumberProblem:
     """A network that is a function of numbers, as a descent needs it; the last point is cached."""
 
     def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
@@ -330,7 +330,7 @@ class NumberProblem:
             low=low,
             high=high,
             unit=unit,
-            sharpnesses=[criterion.sharpness for criterion in self.criterion.sharper()],
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.list_from_smoothest()],
             evaluate=self.evaluate,
             restore=lambda x: x,  # limits of powers are no limits of x: only a descent leads back
         )

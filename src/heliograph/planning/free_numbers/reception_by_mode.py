@@ -1,4 +1,4 @@
-"""Reception of a network as its best linear filter needs it: mean gains, noises, observed modes, and sent powers.
+"""Reception in each mode that a receiver observes: mean gains, noises, sent powers, for the best linear filter.
 
 All of it follows from numbers that may be traced. An observed loss, and the observed mode of a link with memory, are
 modes; in a known mode a channel forgets. Where probabilities are uncertain, and with them a mean gain M_v, the error
@@ -25,9 +25,9 @@ from heliograph.numerics.types import Array, Bool, Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.free_numbers.mode_riccati import ModeSystem
 from heliograph.planning.plant_moments import (
-    check_design_plant,
     measured_moment_with_one,
     moments_with_one_over,
+    require_design_plant,
     steady_moment_with_one,
 )
 from heliograph.planning.transmitters import compute_powers_of_law, transmitter_names
@@ -117,7 +117,7 @@ def list_transmitters(network: Network) -> tuple[str, ...]:
 
 def check_time_variation(network: Network, error: Error) -> None:
     """Raise ValueError unless all that varies over time in a network fits an error's horizon, or else its period."""
-    check_design_plant(network.plant)
+    require_design_plant(network.plant)
     covered = steps_covered((network.plant, list_sources(network)))
     if error.horizon is not None:
         check_horizon(error.horizon, covered)
@@ -149,7 +149,7 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     seconds = [steady_moment_with_one(plants[0])] * steps if forever else moments_with_one_over(network.plant, steps)
     states = jnp.stack([jnp.asarray(second) for second in seconds])
     b = None if young is None else jnp.broadcast_to(young, (steps,))
-    nodes = [describe_reception(name, source, states, forever, b) for name, source in list_sources(network).items()]
+    nodes = [compute_node_reception(name, source, states, forever, b) for name, source in list_sources(network).items()]
     count = prod(node.law.shape[1] for node in nodes)
     if count > MOST_MODES:
         raise fail("modes of a design", f"at most {MOST_MODES} together", count)
@@ -184,7 +184,7 @@ def _stack_nodes(nodes: list[NodeReception]) -> tuple[Array, Array]:
     return jnp.stack(outputs, axis=1), jnp.stack(noises, axis=1)
 
 
-def describe_reception(
+def compute_node_reception(
     name: str, source: SensorAndChannel, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
 ) -> NodeReception:
     """Return what a node receives at each step: the chain of its channel's observed modes, H, N and sent powers.
@@ -203,14 +203,16 @@ def describe_reception(
     steps, varies = len(states), isinstance(source.sensor, OverTime) or isinstance(source.channel, OverTime)
     spans = [range(k, k + 1) for k in range(steps)] if varies else [range(steps)]
     channels = [at(source.channel, span[0]) for span in spans]
-    modes = [_observe_modes(name, channel) for channel in channels]
+    modes = [_find_observed_modes(name, channel) for channel in channels]
     law, chain = _find_laws_and_chain(modes, [len(span) for span in spans], forever)
     # H, N and powers over each span.
     parts = []
     for span, channel, of_channel in zip(spans, channels, modes, strict=True):
         now = np.array(span)
         b = None if young is None else young[now]
-        parts.append(_describe_steps(at(source.sensor, span[0]), channel, of_channel, states[now], b, law[now]))
+        parts.append(
+            _compute_steps_reception(at(source.sensor, span[0]), channel, of_channel, states[now], b, law[now])
+        )
     over_time = _StepsReception(*(jnp.concatenate(of_spans) for of_spans in zip(*parts, strict=True)))
     return NodeReception(chain=chain, law=law, **over_time._asdict())
 
@@ -236,10 +238,10 @@ def _find_laws_and_chain(
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
     """Decide whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
-    return all(has_known_mean(second_order(mode_map)) for mode_map in _observe_modes(name, channel).maps)
+    return all(has_known_mean(second_order(mode_map)) for mode_map in _find_observed_modes(name, channel).maps)
 
 
-def _observe_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
+def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedModes:
     """Return the modes of a channel that its receiver observes, with what arrives in each, and whether they forget.
 
     Without memory they are the outcomes of its losses; with memory the modes of its chains, which it delivers.
@@ -296,7 +298,7 @@ def _propagate_laws(
     return jnp.stack(law), jnp.concatenate([into_first[None], onward[:-1]])
 
 
-def _describe_steps(
+def _compute_steps_reception(
     sensor: LinearSensor,
     channel: AbstractRandomAffine,
     modes: _ObservedModes,
@@ -319,7 +321,7 @@ def _describe_steps(
     # H and N of each mode, from E (y, 1)(y, 1)' of what the sensor measures at each step.
     y = jax.vmap(lambda second: measured_moment_with_one(sensor, second))(states)
     pairs = zip(modes.maps, modes.arrived, strict=True)
-    described = [_describe_mode(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
+    described = [_compute_mode_reception(mode_map, arrived, y, sensor, young) for mode_map, arrived in pairs]
     outputs = [jnp.tile(h, (len(y), 1, 1)) for h, _ in described]  # H of a mode is the same at each step
 
     def compute_powers(moment: Array, law: Array) -> Array:
@@ -337,7 +339,7 @@ def _describe_steps(
     )
 
 
-def _describe_mode(
+def _compute_mode_reception(
     channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
     """Return H = M C and N of one mode, M the mean gain, C the sensor's matrix and R the covariance of its noise.

@@ -80,7 +80,7 @@ class PathProblem(NamedTuple):
 
         The gradient is by the powers p (time, free).
         """
-        problem = self._replace(criterion=self.criterion.supporting(self.covariances(powers)))
+        problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
         value, _, gradient = problem.sensitivity(powers)
         return problem, value, gradient
 
@@ -117,7 +117,7 @@ class PathProblem(NamedTuple):
             low=np.zeros(peak.size),
             high=peak.ravel(),
             unit=np.full(peak.size, self.scale),
-            sharpnesses=[criterion.sharpness for criterion in self.criterion.sharper()],
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.list_from_smoothest()],
             evaluate=self.evaluate,
             restore=lambda x: self.limits.clip_powers(x.reshape(peak.shape)).ravel(),
         )
@@ -147,7 +147,7 @@ class PowerTask(NamedTuple):
         """Return the paths as functions of the power that their free hops send together."""
         return split_paths(self.problem.paths, self.free, self.fixed)
 
-    def relax(self) -> PathProblem:
+    def relax_to_whole_paths(self) -> PathProblem:
         """Return the convex problem in the power of whole paths, whose least error is a lower bound of this one's.
 
         A path may send what its hops may together, and split it at its best; its information is replaced by the concave
@@ -167,7 +167,7 @@ class PowerTask(NamedTuple):
             limits=limits._replace(peak=peak, mean=mean),
         )
 
-    def of_paths(self, powers: Powers) -> Float[np.ndarray, "time path"]:
+    def sum_by_path(self, powers: Powers) -> Float[np.ndarray, "time path"]:
         """Return the power of the free hops of each path together (time, path), from theirs (time, free)."""
         total = np.zeros(self.problem.paths.second.shape)
         np.add.at(total.T, self.problem.path, powers.T)
@@ -274,9 +274,9 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     stationarity = max(tangent_value - bound, 0.0) / value
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
-        relaxed = task.relax()
-        relaxed_powers = relaxed.solve_from_starts([task.of_paths(powers)])
-        bound = relaxed.lower_bound(task.of_paths(powers) if relaxed_powers is None else relaxed_powers)
+        relaxed = task.relax_to_whole_paths()
+        relaxed_powers = relaxed.solve_from_starts([task.sum_by_path(powers)])
+        bound = relaxed.lower_bound(task.sum_by_path(powers) if relaxed_powers is None else relaxed_powers)
     return powers, Certificate(
         convex=task.convex,
         value=value,
@@ -305,7 +305,7 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
     stationarity = 1 - bound / total if total > 0 else 0.0
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
-        relaxed, of_paths = unlimited.relax(), task.of_paths(powers)
+        relaxed, of_paths = unlimited.relax_to_whole_paths(), task.sum_by_path(powers)
         relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
         bound = relaxed.bound_least_total(of_paths if relaxed_powers is None else relaxed_powers, target)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())

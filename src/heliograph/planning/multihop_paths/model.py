@@ -184,8 +184,8 @@ def independent_paths(
     r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
     # kappa and alpha of all hops (sensors, hops of each); one of alpha without a second axis.
     sensors, hops_each = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
-    hop_kappa = _check_hops("kappa of paths", kappa, (sensors, hops_each), least=1.0)
-    hop_alpha = _check_hops("alpha of paths", alpha, (sensors, hops_each), least=0.0)
+    hop_kappa = _read_hop_numbers("kappa of paths", kappa, (sensors, hops_each), least=1.0)
+    hop_alpha = _read_hop_numbers("alpha of paths", alpha, (sensors, hops_each), least=0.0)
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
     start = None
     if error.horizon is not None:
@@ -215,7 +215,9 @@ def require_at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) ->
     return value
 
 
-def _check_hops(name: str, value: ArrayLike, shape: tuple[int, int], least: float) -> Float[np.ndarray, "sensors hops"]:
+def _read_hop_numbers(
+    name: str, value: ArrayLike, shape: tuple[int, int], least: float
+) -> Float[np.ndarray, "sensors hops"]:
     """Return a number for each hop, of this shape (sensors, hops of each), none below `least`.
 
     Args:
@@ -232,7 +234,7 @@ def _check_hops(name: str, value: ArrayLike, shape: tuple[int, int], least: floa
     return require_at_least(least, name, array(name, numbers, shape))
 
 
-def fading(paths: Paths) -> PathValues:
+def compute_path_kappas(paths: Paths) -> PathValues:
     """Return K (time, path), the product of kappa = E g^2 / (E g)^2 of the hops along each path."""
     return np.asarray(_arrange_by_place(paths, paths.kappa)[0].prod(axis=-1))
 
@@ -264,7 +266,7 @@ def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     path, s = E y^2 of what is sent, t = s less the sensor's noise, and K the product of kappa.
     """
     factors, position = _arrange_by_place(paths, share_of_signal(powers, paths.alpha))  # (time, path, place)
-    product, full = factors.prod(axis=-1), paths.second * fading(paths)  # F and s K
+    product, full = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)  # F and s K
     left = full - paths.signal * product
     # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
     places = range(factors.shape[-1])

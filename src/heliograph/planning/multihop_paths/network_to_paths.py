@@ -12,9 +12,9 @@ from heliograph.numerics.types import Float
 from heliograph.planning.error_objective import Error
 from heliograph.planning.multihop_paths.model import Paths, PlantSteps
 from heliograph.planning.plant_moments import (
-    check_design_plant,
     measured_moment_with_one,
     moments_with_one_over,
+    require_design_plant,
     steady_moment_with_one,
 )
 from heliograph.planning.transmitters import compute_sent_powers
@@ -55,8 +55,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     """
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps
-    start_plant = check_design_plant(plant)
-    nodes = _check_sending_nodes(network)
+    start_plant = require_design_plant(plant)
+    nodes = _require_plain_nodes(network)
     # Second moments E (x, 1)(x, 1)' of the plant at each step, or in its steady state.
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
@@ -67,7 +67,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         check_horizon(steps, covered)
         seconds, start = moments_with_one_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's A and Q.
-    described = [_build_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
+    described = [_make_paths_of_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
     paths = Paths(
         plants=PlantSteps(
@@ -86,12 +86,12 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     return paths, np.array([step.powers for step in described])
 
 
-def _check_sending_nodes(network: Network) -> dict[str, Node]:
+def _require_plain_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes by name; refuse relays that filter, nodes that share a channel, and senders that decide."""
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
-        raise _unfit("nodes that share a channel (give a function of free numbers)")
+        raise _make_no_paths_error("nodes that share a channel (give a function of free numbers)")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     deciding = [name for name, node in nodes.items() if node.trigger is not None]
     if deciding:
@@ -99,7 +99,7 @@ def _check_sending_nodes(network: Network) -> dict[str, Node]:
     return nodes
 
 
-def find_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[HopChain]:
+def find_hop_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[HopChain]:
     """Return the chains of a channel that carries the numbers rows @ (y, 1); names of hops begin with `prefix`.
 
     y: the sensor's outputs. A wire is a known matrix without noise; the parts of a stack are chains side by side.
@@ -118,9 +118,9 @@ def find_chains(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], 
     if not isinstance(head, Stack):
         return [_make_chain([head, *rest], rows, prefix)]
     if rest:
-        raise _unfit("a stack that is sent on")
+        raise _make_no_paths_error("a stack that is sent on")
     parts = enumerate(head.maps, 1)
-    return [chain for i, affine in parts for chain in find_chains(affine, rows, f"{prefix}part{i}.")]
+    return [chain for i, affine in parts for chain in find_hop_chains(affine, rows, f"{prefix}part{i}.")]
 
 
 def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1"], prefix: str) -> HopChain:
@@ -135,7 +135,7 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
         ValueError: maps that are not hops of one number, wires, and unobserved losses.
     """
     if parts[-1].outputs != 1:
-        raise _unfit(f"one gain for {parts[-1].outputs} numbers")
+        raise _make_no_paths_error(f"one gain for {parts[-1].outputs} numbers")
     row = rows[0]
     loss_factor = 1.0  # product of the losses' kappas
     has_offset = False  # whether a wire behind a hop has added a constant
@@ -149,16 +149,16 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
             parts, loss_factor = [*inner.in_series, *parts], loss_factor * factor
             continue
         if not isinstance(affine, GainAndNoise):
-            raise _unfit(type(affine).__name__)
+            raise _make_no_paths_error(type(affine).__name__)
         # The first map may combine several numbers; of a single one the hop's alpha holds the unit already.
         if not hops:
             row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]
         if affine.transmits:
             if has_offset:
-                raise _unfit("a relay that takes a reference off")
-            hops[f"{prefix}hop{len(hops) + 1}"] = _describe_hop(affine)
+                raise _make_no_paths_error("a relay that takes a reference off")
+            hops[f"{prefix}hop{len(hops) + 1}"] = _compute_hop_kappa_and_alpha(affine)
         elif affine.inputs != 1 or affine.outputs != 1:
-            raise _unfit("a wire of several numbers behind a hop")
+            raise _make_no_paths_error("a wire of several numbers behind a hop")
         elif hops:  # a wire behind a hop: its gain changes no ratio, but a constant would be amplified by a relay
             has_offset = has_offset or bool(np.any(np.asarray(affine.noise.mean)))
     # Losses multiply kappa of the last hop: a path's information depends on the product of its kappas alone.
@@ -167,19 +167,19 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
         kappa, alpha = hops[last]
         hops[last] = (kappa * loss_factor, alpha)
     elif loss_factor > 1:
-        raise _unfit("a wire that loses what it carries")
+        raise _make_no_paths_error("a wire that loses what it carries")
     return HopChain(row, hops)
 
 
-def _describe_hop(hop: GainAndNoise) -> tuple[float, float]:
+def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
     """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m."""
     if len(hop.law.extremes()) > 1:
-        raise _unfit("a gain with uncertain probabilities")
+        raise _make_no_paths_error("a gain with uncertain probabilities")
     mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
     if mean == 0:
         raise fail("hop", "a gain whose mean is not zero (a linear filter receives no signal else)", "mean 0")
     if np.any(np.asarray(hop.noise.mean)):
-        raise _unfit("noise with a mean")
+        raise _make_no_paths_error("noise with a mean")
     return square / mean**2, float(np.asarray(hop.noise.covariance)[0, 0]) / square
 
 
@@ -191,7 +191,7 @@ def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
     p = np.asarray(mixture.choice.probabilities)
     audible = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
     if len(audible) != 1 or mixture.corner_count() > 1 or not p[audible[0]] > 0:
-        raise _unfit("a mixture of several channels")
+        raise _make_no_paths_error("a mixture of several channels")
     return mixture.maps[audible[0]], 1 / float(p[audible[0]])
 
 
@@ -200,7 +200,7 @@ def _delivers_nothing(affine: AbstractRandomAffine) -> bool:
     return isinstance(affine, GainAndNoise) and not np.any(np.append(affine.matrix, affine.noise.covariance))
 
 
-def _unfit(got: str) -> ValueError:
+def _make_no_paths_error(got: str) -> ValueError:
     """Return the error that names what is no independent path."""
     return fail("network", "independent paths, each a chain of hops for one number", got)
 
@@ -222,7 +222,7 @@ class _PathsOfStep(NamedTuple):
     path: list[int]
 
 
-def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
+def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _PathsOfStep:
     """Return the paths of all nodes at step k: what each carries, its powers, and its hops.
 
     `state`: E (x, 1)(x, 1)' of the plant's state at this step.
@@ -230,14 +230,14 @@ def _build_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 
     step = _PathsOfStep(rows=[], second=[], signal=[], kappa=[], alpha=[], powers=[], names=[], path=[])
     for name, node in nodes.items():
         if node.informed_by is not None:
-            raise _unfit("a sensor with feedback, whose power depends on the error")
+            raise _make_no_paths_error("a sensor with feedback, whose power depends on the error")
         sensor, channel = at(node.sensor, k), at(node.channel, k)
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
         # Chains of the channel, and what their transmitters send at present, by E (y, 1)(y, 1)' of the outputs.
         measured, noise = np.asarray(measured_moment_with_one(sensor, state)), np.asarray(sensor.noise.covariance)
-        chains = find_chains(channel, np.eye(len(sensor.outputs), len(measured)))
+        chains = find_hop_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
         # Each chain is a path that carries chain.row @ (y, 1). Its number is that of its row in the list.
@@ -266,4 +266,4 @@ def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance
     noise = rows @ covariance @ rows.T
     deviation = np.sqrt(np.diag(noise))
     if np.any(np.abs(noise - np.diag(np.diag(noise))) > UNCORRELATED * np.outer(deviation, deviation)):
-        raise _unfit(f"paths of {name!r} that share a sensor's noise")
+        raise _make_no_paths_error(f"paths of {name!r} that share a sensor's noise")

@@ -1,4 +1,4 @@
-"""Most information that a path of several hops carries for its power, and its concave envelope: bounds of all designs.
+"""Best split of a path's power over its hops, the information that it gives, and the envelope that bounds it.
 
 With the power P of a path split at its best, p_h(l) = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with sum P, it
 carries j(P) = 1 / (D - t), D = A prod (1 + alpha_h / p_h), A = s K, and dD/dP = -l D. With several hops j is S-shaped.
@@ -18,7 +18,7 @@ from heliograph.planning.multihop_paths.model import (
     Paths,
     PathValues,
     Powers,
-    fading,
+    compute_path_kappas,
     require_at_least,
     share_of_signal,
 )
@@ -55,7 +55,7 @@ class SplitPaths(NamedTuple):
 
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
     """Return the paths by the power that their free hops send together; the others send the powers `fixed`."""
-    full = paths.second * fading(paths)
+    full = paths.second * compute_path_kappas(paths)
     # alpha of the free hops of each path.
     free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
     alpha = np.zeros((*full.shape, max(1, max(len(hops) for hops in free_hops))))

@@ -105,7 +105,7 @@ class Translator:
         try:
             arrival = None
             if message.arrival is not None:
-                arrival = date_of(parse_arrival(message.arrival, f"{message.where}, arrival"))
+                arrival = convert_nanoseconds_to_date(parse_arrival(message.arrival, f"{message.where}, arrival"))
         except InputError as error:
             return [str(error)]
         return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
@@ -148,7 +148,7 @@ class Translator:
             if not self.sources.of(topic):
                 self.sources.unknown[topic] += 1
                 return []
-            content = _decode(payload, where)
+            content = _decode_json(payload, where)
             for reading in self.sources.read(topic, content, where):
                 if isinstance(reading, Unread):
                     results.append(self._explain_unread(where, reading, arrival, repeatable))
@@ -224,7 +224,7 @@ class Translator:
             return arrival
         if self.sources.time_counts_steps and self.sources.step_seconds is None:
             return float(reading.time)
-        time = date_of(reading.time)
+        time = convert_nanoseconds_to_date(reading.time)
         is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # a clock that was never set
         if is_unset:
             expected = f"a time that was set, near that of arrival, {arrival.isoformat()}"
@@ -239,10 +239,10 @@ class Translator:
         if reading.sequence is not None:
             return reading.sequence
         name = reading.plant, reading.node
-        number = self._counts[name]
+        number = self._counts[name]  # of all readings of this node before
+        self._counts[name] += 1
         if reading.time is not None:
             number = self._number_among_simultaneous(reading, repeatable)
-        self._counts[name] += 1
         return number
 
     def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
@@ -261,7 +261,7 @@ class Translator:
         return len(values) - 1
 
 
-def date_of(nanoseconds: int) -> datetime:
+def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
     """Return a date, to the microsecond, from nanoseconds since 1970.
 
     Raises:
@@ -273,7 +273,7 @@ def date_of(nanoseconds: int) -> datetime:
         raise fail("time", "a date of these thousand years", nanoseconds) from None
 
 
-def _decode(payload: object, where: str) -> object:
+def _decode_json(payload: object, where: str) -> object:
     """Return the content of a payload of JSON; what is read already, as a row's columns, as it is."""
     if not isinstance(payload, bytes | str):
         return payload

@@ -18,7 +18,7 @@ from heliograph.files.text.dialects import COMMENTS, names_in
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError
 from heliograph.serving.brokers.replay import check_time_steps, encode_event, events_of_recording, row_events
-from heliograph.serving.brokers.source_translator import Translator, date_of
+from heliograph.serving.brokers.source_translator import Translator, convert_nanoseconds_to_date
 from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import Message, Payload, UnreadMessage
 from heliograph.simulation.network import Network
@@ -195,10 +195,10 @@ def read_own_event(reader: OwnReader, where: str, content: dict[str, object]) ->
 def _make_message(reader: OwnReader, reading: Reading, arrival: float) -> Message:
     """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
-    time = reading.time if reader.numbers else date_of(int(reading.time))
+    time = reading.time if reader.numbers else convert_nanoseconds_to_date(int(reading.time))
     stated_arrival = None
     if arrival != reading.time:
-        stated_arrival = arrival if reader.numbers else date_of(int(arrival))
+        stated_arrival = arrival if reader.numbers else convert_nanoseconds_to_date(int(arrival))
     return Message.model_construct(
         plant=reading.plant,
         node=reading.node,

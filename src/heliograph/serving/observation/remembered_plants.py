@@ -18,7 +18,7 @@ POINTS = 800  # estimates remembered of each, final ones and those that are not 
 LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
 
 
-class EstimatePoint(NamedTuple):
+class ChartPoint(NamedTuple):
     """Estimates of a plant at one time: means and standard deviations by node and filter. `number` counts the points.
 
     A final point replaces the provisional ones of its time.
@@ -30,7 +30,7 @@ class EstimatePoint(NamedTuple):
     estimates: dict[str, dict[str, dict[str, object]]]
 
 
-class PlantMemory:
+class RememberedPlants:
     """What is remembered of the plants with the newest messages, by plant, the oldest forgotten first.
 
     Attributes:
@@ -46,7 +46,7 @@ class PlantMemory:
     def __init__(self, names: Mapping[tuple[str, str], Sequence[str]]):
         """Begin with no plant; `names`: those of the received numbers by node and filter."""
         self.count, self._names = 0, names  # names of the received numbers by node and filter
-        self.points: OrderedDict[str, deque[EstimatePoint]] = OrderedDict()
+        self.points: OrderedDict[str, deque[ChartPoint]] = OrderedDict()
         self.outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self.crossings: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
@@ -74,7 +74,7 @@ class PlantMemory:
             for node, filters in message["estimates"].items()
         }
         points = _move_to_newest(self.points, plant, lambda: deque(maxlen=POINTS))
-        points.append(EstimatePoint(self.count, message["time"], message["kind"] == "final", estimates))
+        points.append(ChartPoint(self.count, message["time"], message["kind"] == "final", estimates))
         if message.get("senders"):
             _move_to_newest(self.senders, plant, dict).update(message["senders"])
             dead = [node for node, sender in message["senders"].items() if sender["dead"]]

@@ -17,9 +17,9 @@ from heliograph.model.estimate import Claim
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.types import unit_of, units_in
 from heliograph.report.outputs import RecentOutputs, make_output_row
-from heliograph.serving.count_totals import FIELDS, CountTotals, counts_of
+from heliograph.serving.count_totals import FIELDS, CountTotals, list_counts_of_link
 from heliograph.serving.observation.answers_between_batches import LastAnswers
-from heliograph.serving.observation.remembered_plants import PLANTS, BatchHistograms, PlantMemory
+from heliograph.serving.observation.remembered_plants import PLANTS, BatchHistograms, RememberedPlants
 from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
 from heliograph.serving.observation.trouble_overview import PlantTroubles, TroubleOverview
 from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
@@ -96,7 +96,7 @@ class Watch:
         self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)
         self._batches = BatchHistograms()
         # Of each plant with a new message.
-        self._memory = PlantMemory(names or {})
+        self._memory = RememberedPlants(names or {})
 
     @property
     def registry(self) -> CollectorRegistry:
@@ -131,7 +131,7 @@ class Watch:
         for name, plant in self._iterate_plants(plants):
             self.totals.add_plant(name, plant.links)
         for name in plants:
-            self._overview.touch(name)
+            self._overview.note_change(name)
         for output in outputs:
             if output.kind in ("provisional", "final"):
                 message = from_json(output.body)
@@ -316,7 +316,7 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
     for plant in plants:
         for node, link in plant.links.items():
             tally = results.setdefault(node, dict.fromkeys(FIELDS, 0))
-            for name, count in counts_of(link).items():
+            for name, count in list_counts_of_link(link).items():
                 tally[name] += count
     return results
 

@@ -56,7 +56,7 @@ class TroubleOverview:
         self.touched = set[str]()  # since the last look
         self._wrong: dict[str, PlantTroubles] = {}
 
-    def touch(self, plant: str) -> None:
+    def note_change(self, plant: str) -> None:
         """Note that a plant has had a message, or that its silence has changed."""
         self.touched.add(plant)
 

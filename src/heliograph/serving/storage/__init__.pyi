@@ -11,5 +11,5 @@ from .store_protocol import Entry as Entry
 from .store_protocol import InMemoryStore as InMemoryStore
 from .store_protocol import StoreProtocol as StoreProtocol
 from .store_protocol import StoredPlant as StoredPlant
+from .store_protocol import describe_damaged_plants as describe_damaged_plants
 from .store_protocol import identity as identity
-from .store_protocol import report_damage as report_damage

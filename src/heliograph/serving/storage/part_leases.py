@@ -9,7 +9,7 @@ from sqlalchemy.engine import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.numerics.check import fail
-from heliograph.serving.storage.database import is_away
+from heliograph.serving.storage.database import is_server_away
 from heliograph.serving.storage.store_protocol import AwayError
 
 TABLES = MetaData()
@@ -65,7 +65,7 @@ class Leases:
         try:
             yield
         except SQLAlchemyError as error:
-            if not is_away(error):
+            if not is_server_away(error):
                 raise
             said = str(getattr(error, "orig", error))
             raise AwayError(str(fail("leases of parts", "a database that answers", said))) from None

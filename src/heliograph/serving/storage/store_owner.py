@@ -11,7 +11,7 @@ from sqlalchemy.engine import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.numerics.check import InputError, fail
-from heliograph.serving.storage.database import is_away, open_database
+from heliograph.serving.storage.database import is_server_away, open_database
 from heliograph.serving.storage.store_protocol import AwayError
 
 try:
@@ -58,7 +58,7 @@ def own_store(location: str, process: str) -> Iterator[None]:
     except SQLAlchemyError as error:
         where = engine.url.render_as_string(hide_password=True)
         refused = fail(f"store {where}", "a server that answers", str(getattr(error, "orig", error)))
-        raise AwayError(str(refused)) if is_away(error) else refused from None
+        raise AwayError(str(refused)) if is_server_away(error) else refused from None
     finally:
         engine.dispose()
 
@@ -78,7 +78,7 @@ def _lock_file(path: str, process: str) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise _refuse_taken(path, os.read(file, 200).decode(errors="replace").strip()) from None
+                raise _make_taken_error(path, os.read(file, 200).decode(errors="replace").strip()) from None
         os.ftruncate(file, 0)
         os.write(file, f"{name_of_process()}\n".encode())
         yield
@@ -97,11 +97,11 @@ def _lock_session(engine: Engine, process: str) -> Iterator[None]:
         if not locked.scalar():
             row = connection.execute(WHOSE, {"space": SPACE, "key": key}).first()
             whose = "" if row is None else f"{row[0].removeprefix('heliograph ')} at {row[1]}"
-            raise _refuse_taken(engine.url.render_as_string(hide_password=True), whose)
+            raise _make_taken_error(engine.url.render_as_string(hide_password=True), whose)
         connection.commit()
         yield
 
 
-def _refuse_taken(where: str, whose: str) -> InputError:
+def _make_taken_error(where: str, whose: str) -> InputError:
     """Return the error that another service has the store."""
     return fail(f"store {where}", "one that no other service has", f"that of {whose or 'another'}; {MEND}")

@@ -26,14 +26,14 @@ def checksum(name: str | int, *values: str | int | bytes) -> int:
     return (crc32(f"{name}".encode()) >> 1) << 32 | _checksum_row(name, values)
 
 
-def is_whole(written: object, name: object, *values: object) -> bool:
+def is_row_undamaged(written: object, name: object, *values: object) -> bool:
     """Return whether a row is as it was written; a damaged row may contain anything."""
     if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
         return False
     return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
 
 
-def is_named(written: object, name: object) -> bool:
+def is_name_undamaged(written: object, name: object) -> bool:
     """Return whether the name of a row is as it was written, whatever became of its values."""
     return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
 
@@ -47,7 +47,7 @@ def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
     return checksum
 
 
-def with_checksum(table: Table, *values: Any) -> dict[str, object]:
+def add_checksum(table: Table, *values: Any) -> dict[str, object]:
     """Return a row of a table, with its checksum, by column."""
     columns = [column.name for column in table.c]
     return dict(zip(columns, (*values, checksum(*values)), strict=True))
