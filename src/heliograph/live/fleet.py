@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_contradicted_leap
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
 from heliograph.live.link_counts import ScreenedEvent
 from heliograph.live.network_step_program import NetworkProgram
@@ -244,7 +244,7 @@ class Fleet:
         """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
-        the same; if the next goes on from before it, it is withdrawn (`Leap` says it in full).
+        the same; if the next goes on from before it, it is withdrawn (`ClockLeap` says it in full).
 
         Args:
             plant: the plant.
@@ -288,7 +288,7 @@ class Fleet:
                 plant.leap = None
         plant.now = max(plant.now, now)
 
-    def undo_events(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
+    def undo_events(self, plant: PlantState, clock: tuple[float, ClockLeap | None]) -> None:
         """Restore a plant to its state before the events taken since it was last finalised; `clock`: its own then."""
         self.pool.free_slots(plant.undo_changes())
         plant.clock = clock

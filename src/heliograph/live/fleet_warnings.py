@@ -9,7 +9,7 @@ from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import HeldRow
 
 
-class FleetRemarks:
+class RemarkWatch:
     """Watch for what filters say of their states, by the newest row of each plant.
 
     A late event may make a row anew, so that what was said never happened; it is counted all the same, and what happens

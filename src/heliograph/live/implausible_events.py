@@ -221,7 +221,7 @@ class WatchedAngles(NamedTuple):
     angles: WideAngles
 
 
-class FleetAngles:
+class AngleWatch:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):

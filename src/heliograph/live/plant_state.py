@@ -10,7 +10,7 @@ from datetime import datetime
 from math import inf
 from typing import NamedTuple, TypeAlias
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_contradicted_leap
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
@@ -28,7 +28,7 @@ class WithdrawnEvent(NamedTuple):
 Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
 
 
-class BeforeLeap(NamedTuple):
+class RowBeforeLeap(NamedTuple):
     """The newest row before a leap in time, and the newest arrival before it."""
 
     row: HeldRow
@@ -47,7 +47,7 @@ class RowsOfLeap(NamedTuple):
     """
 
     held: list[HeldRow]
-    kept: BeforeLeap | None
+    kept: RowBeforeLeap | None
     changes: int
     gone: list[HeldRow]
     rows: list[HeldRow]
@@ -84,9 +84,9 @@ class PlantState:
     forced: int = 0
     links: dict[str, LinkCounts] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
-    leap: Leap | None = None
+    leap: ClockLeap | None = None
     silence: HeldRow | None = None
-    kept: BeforeLeap | None = None
+    kept: RowBeforeLeap | None = None
     aside: list[RowsOfLeap] = field(default_factory=list)
     remarked: dict[tuple[str, str], int] = field(default_factory=dict)
     begun: float = 0.0
@@ -97,12 +97,12 @@ class PlantState:
         return self.now if self.leap is None or self.leap.believed else self.leap.now
 
     @property
-    def clock(self) -> tuple[float, Leap | None]:
+    def clock(self) -> tuple[float, ClockLeap | None]:
         """Return the newest arrival, and the leap in time that led to it where no other clock confirms it."""
         return self.now, self.leap
 
     @clock.setter
-    def clock(self, clock: tuple[float, Leap | None]) -> None:
+    def clock(self, clock: tuple[float, ClockLeap | None]) -> None:
         """Set the newest arrival and the leap to what they were."""
         self.now, self.leap = clock
 
@@ -150,10 +150,10 @@ class PlantState:
         # A new leap, unless one is open still that nothing has confirmed: this event then is of its far side.
         if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
             moments = {node: (link.at, link.latest) for node, link in self.links.items()}
-            leap = Leap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
+            leap = ClockLeap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
         self.now, self.leap = max(newest, now), leap
 
-    def _confirm_leap(self, clock: str, leap: Leap, time: float, longest_gap: float) -> Leap | None:
+    def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
         """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed."""
         if clock != leap.clock:
             return None
@@ -165,7 +165,7 @@ class PlantState:
             return leap
         return leap.as_believed()
 
-    def undo_leap(self, leap: Leap, longest_gap: float, names: Sequence[str]) -> bool:
+    def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
         """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
 
         Returns False, and changes nothing, if the row before it is not known any more.
@@ -196,7 +196,7 @@ class PlantState:
         self.now, self.leap = leap.now, leap.earlier
         return True
 
-    def _count_withdrawn(self, rows: Sequence[HeldRow], leap: Leap, names: Sequence[str]) -> None:
+    def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
         """Count the events of rows that a leap made as withdrawn, by node; `names`: those of nodes, then inputs."""
         counts: dict[str, int] = {}
         for row in rows:
@@ -205,7 +205,7 @@ class PlantState:
         for name, count in counts.items():
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
-    def holds_rows_before(self, leap: Leap, time: float, longest_gap: float) -> bool:
+    def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
         """Return whether rows from before a leap are held, and `time` comes after the first of them."""
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
@@ -331,7 +331,7 @@ class PlantState:
         if leap is not None and self.kept is None:
             before = [row for row in left if row.key[0] < leap.time - longest_gap]
             if before and self.rows.held[0].key[0] >= leap.time - longest_gap:  # all rows held are after the leap
-                self.kept = BeforeLeap(before[-1], leap.now)
+                self.kept = RowBeforeLeap(before[-1], leap.now)
                 left = [row for row in left if row is not before[-1]]
         return [row.slot for row in left]
 

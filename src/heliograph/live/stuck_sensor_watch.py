@@ -87,7 +87,7 @@ class RepeatWatch:
             readings[i] += 1
             # Found once, when its length reaches what is too long. Shorter than LEAST none is: most end here.
             if lengths[i] >= LEAST:
-                too_long = self._count_too_many(i, lengths[i], least_steps[i], readings[i], equal[i])
+                too_long = self._find_least_count_too_long(i, lengths[i], least_steps[i], readings[i], equal[i])
                 found[i] += lengths[i] == too_long
         return Repeats(
             newest=tuple(newest),
@@ -104,7 +104,7 @@ class RepeatWatch:
         `output`: its index; `name`: what it is called; `repeats`: the runs so far.
         """
         length, value = repeats.lengths[output], repeats.newest[output]
-        count = self._count_too_many(
+        count = self._find_least_count_too_long(
             output, length, step=repeats.steps[output], readings=repeats.readings[output], equal=repeats.equal[output]
         )
         return (
@@ -122,7 +122,7 @@ class RepeatWatch:
             self._bounds[key] = float(max(bounds))
         return self._bounds[key]
 
-    def _count_too_many(self, output: int, length: int, step: float, readings: int, equal: int) -> float:
+    def _find_least_count_too_long(self, output: int, length: int, step: float, readings: int, equal: int) -> float:
         """Return the least count of equal readings in a row that is too long for an output; infinite if none is.
 
         Args:

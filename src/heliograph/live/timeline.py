@@ -10,9 +10,9 @@ import numpy as np
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_warnings import FleetRemarks, FleetRepeatWatch
+from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
 from heliograph.live.forecast_start_of_row import estimates_by_name, judged_estimates_by_name, make_forecast_origin
-from heliograph.live.implausible_events import CandidateEvent, FleetAngles, JudgementReader
+from heliograph.live.implausible_events import AngleWatch, CandidateEvent, JudgementReader
 from heliograph.live.link_counts import LinkCounts
 from heliograph.live.network_step_program import shared_program
 from heliograph.live.sender_status import SenderStatus
@@ -97,7 +97,7 @@ class Timeline:
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
-        self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
+        self._angles, self._remarks = AngleWatch(self._fleet), RemarkWatch(self._fleet)
         self._held = FleetRepeatWatch(self._fleet)
         # Of final rows: what filters left out, and the outputs that `final` has not returned yet.
         self._gates = GateCounts(self._program.filter_columns)

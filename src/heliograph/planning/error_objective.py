@@ -116,7 +116,7 @@ class Criterion(NamedTuple):
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
-    def exact(self, p: Matrices) -> float:
+    def compute_exact_error(self, p: Matrices) -> float:
         """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
         if self.sharpness is None:
             return self.smooth(p)[0]

@@ -125,7 +125,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)
     sends_already = isinstance(network, Network)
-    present_error = task.problem.exact(present_powers[:, free]) if sends_already else float("nan")
+    present_error = task.problem.compute_exact_error(present_powers[:, free]) if sends_already else float("nan")
     return design_paths(problem, task, target, present_error)
 
 

@@ -211,7 +211,7 @@ def _make_task(
         limits=limits,
         free=free,
         covariance=lambda information: steady_covariance_with_information(transition, noise, information),
-        error=lambda covariance: criterion.exact(covariance[None]),
+        error=lambda covariance: criterion.compute_exact_error(covariance[None]),
         starts=check_count("starts", problem.starts),
         seed=check_seed("seed", problem.seed),
     )

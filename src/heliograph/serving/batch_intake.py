@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_contradicted_leap, make_first_leap
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap, make_first_leap
 from heliograph.live.event import INPUTS, CheckedEvent, Verdict
 from heliograph.live.fleet import Fleet
 from heliograph.live.implausible_events import CandidateEvent, JudgementReader
@@ -44,7 +44,7 @@ class PlantBeforeBatch(NamedTuple):
     """
 
     known: bool
-    clock: tuple[float, Leap | None]
+    clock: tuple[float, ClockLeap | None]
     links: dict[str, tuple[Any, ...]]
 
 
@@ -279,7 +279,7 @@ class BatchIntake:
                 return None
         return plant
 
-    def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: Leap) -> PlantState:
+    def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: ClockLeap) -> PlantState:
         """Return a new plant, whose first moment may still turn out wrong.
 
         Of one that begins anew the old is ended, and its events are counted as from the future.

@@ -12,8 +12,8 @@ from typing import NamedTuple
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_warnings import FleetRemarks, FleetRepeatWatch
-from heliograph.live.implausible_events import FleetAngles
+from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
+from heliograph.live.implausible_events import AngleWatch
 from heliograph.live.network_step_program import NetworkProgram as NetworkProgram
 from heliograph.live.plant_state import FinalisedPlant, PlantState, WithdrawnEvent
 from heliograph.live.sorted_rows import HeldRow
@@ -87,7 +87,7 @@ class Service:
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         # What is said of plants: doubts by `_doubt`, the first implausible message by `_say`, which then becomes None.
-        self._angles, self._remarks, self._held = FleetAngles(fleet), FleetRemarks(fleet), FleetRepeatWatch(fleet)
+        self._angles, self._remarks, self._held = AngleWatch(fleet), RemarkWatch(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # number of the newest output published since the last commit
@@ -125,7 +125,7 @@ class Service:
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
         """Tell the estimates by now of plants of which a sender has timed out; nothing is committed."""
-        late = self._silence.find_overdue(self.plants.values(), now)
+        late = self._silence.find_plants_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
@@ -138,7 +138,7 @@ class Service:
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
         # Rows that are final by the clock, and events whose clocks it shows to be wrong.
-        due = self._silence.find_due(self.plants.values(), now)  # plants, each with the step that it is by now
+        due = self._silence.find_plants_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
         finalised = self.fleet.finalise_plants(plant for plant, _ in due)
@@ -163,7 +163,7 @@ class Service:
             Message.model_construct(
                 plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=unchanged, inputs=None, arrival=None
             )
-            for plant, step in self._silence.find_due(self.plants.values(), now)
+            for plant, step in self._silence.find_plants_due(self.plants.values(), now)
         ]
 
     def _take_batch(self, payloads: Sequence[Payload]) -> list[Output]:
@@ -235,8 +235,8 @@ class Service:
         """
         outcomes = self._intake.apply_batch(messages, self._damage, datetime.now(UTC))
         touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}
-        self._tell_doubts(list(touched.values()))
-        entries, malformed, known = self._report_unused(messages, payloads, outcomes)
+        self._warn_of_doubts(list(touched.values()))
+        entries, malformed, known = self._make_entries_on_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.make_messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
@@ -255,7 +255,7 @@ class Service:
         self.known += known
         return outputs + sent + provisional, committed
 
-    def _tell_doubts(self, plants: Sequence[PlantState]) -> None:
+    def _warn_of_doubts(self, plants: Sequence[PlantState]) -> None:
         """Say what is new of these plants: angles known too little, readings that repeat, remarks of filters."""
         if self._doubt is not None:
             for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
@@ -264,7 +264,7 @@ class Service:
             if self._doubt is not None:
                 self._doubt(f"warning: plant {name!r}, {line}")
 
-    def _report_unused(
+    def _make_entries_on_unused(
         self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[MessageOutcome]
     ) -> tuple[list[Entry], int, int]:
         """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
@@ -289,10 +289,10 @@ class Service:
                 entries.append(make_refusal_of_message(message, "malformed", why))
                 continue
             known += outcome.verdict in ("duplicate", "late")
-            entries += self._explain_refusal(message, outcome)
+            entries += self._make_refusal_entries(message, outcome)
         return entries, malformed, known
 
-    def _explain_refusal(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
+    def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
 
         `outcome` has a verdict other than "used", or notes on parts of the message.
@@ -301,10 +301,10 @@ class Service:
         if outcome.verdict is not None and outcome.verdict != "used":
             entries.insert(0, make_refusal_of_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
         if outcome.verdict == "implausible" or outcome.notes:
-            self._warn(message, outcome.why or outcome.notes[0])
+            self._warn_of_implausible(message, outcome.why or outcome.notes[0])
         return entries
 
-    def _warn(self, message: AnyMessage, why: str) -> None:
+    def _warn_of_implausible(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message, once."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""

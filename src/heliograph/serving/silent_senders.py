@@ -59,7 +59,7 @@ class SilenceWatch:
         """Note plants that a service goes on with, of which messages may wait somewhere."""
         self._resumed.update(names)
 
-    def find_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+    def find_plants_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
         """Return the plants of which another step has begun by now without a message, with its number."""
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
@@ -74,7 +74,7 @@ class SilenceWatch:
                 due.append((plant, float(passed)))
         return due
 
-    def find_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+    def find_plants_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
         """Return the plants of which a sender has been silent for longer than its timeout since it was told last.
 
         With the present moment by the clock: its step, or the time where time is continuous.

@@ -57,8 +57,10 @@ def test_water_filling_is_the_optimum_before_any_descent(seed):
     """Its gap closes, and the descent that begins there changes powers by no more than a flat optimum hides."""
     paths, total = random_paths(seed), 2.0 + seed
     task = task_of(paths, total)
-    filled = water_filling(task.problem.limits, task.problem.sensitivity, SplitPaths(*task.whole()), task.starts[0])
-    error = task.problem.exact(filled)
+    filled = water_filling(
+        task.problem.limits, task.problem.sensitivity, SplitPaths(*task.whole_paths()), task.starts[0]
+    )
+    error = task.problem.compute_exact_error(filled)
     assert error - task.problem.lower_bound(filled) <= 1e-13 * error
     np.testing.assert_allclose(filled, powers_of(hg.design(paths, budget=total)), atol=1e-6)
 
@@ -160,7 +162,7 @@ def test_several_hops_are_designed_from_arrays_too():
 
 def test_what_cannot_be_is_refused():
     paths = direct_paths()
-    limit = task_of(paths, 1e13).problem.exact(np.full((1, 6), 1e13))
+    limit = task_of(paths, 1e13).problem.compute_exact_error(np.full((1, 6), 1e13))
     with pytest.raises(hg.InputError, match=rf"target error: expected more than {limit:.5g}.*: unlimited power leaves"):
         hg.design(paths, target_error=0.3)
     with pytest.raises(hg.InputError, match="error: expected that over 1 steps"):

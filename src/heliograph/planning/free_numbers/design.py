@@ -58,7 +58,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound. With a
     # target what was minimised is the power, else the error.
     found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best)
-    network, error = problem.network(best), problem.criterion.exact(found.covariances)
+    network, error = problem.network(best), problem.criterion.compute_exact_error(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
@@ -69,7 +69,7 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
         powers=dict(zip(problem.names, found.powers.T, strict=True)),
         error=error,
         certificate=certificate,
-        present=problem.criterion.exact(present.covariances),
+        present=problem.criterion.compute_exact_error(present.covariances),
         covariance=found.covariances,
         sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
         price=float(np.max(conditions.worth, initial=0.0) * limits.steps),

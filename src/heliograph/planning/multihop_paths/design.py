@@ -53,9 +53,9 @@ class PathProblem(NamedTuple):
         """Return the error covariance P after each step."""
         return compute_error_covariances(self.paths, self.information(powers).information)
 
-    def exact(self, powers: Powers) -> float:
+    def compute_exact_error(self, powers: Powers) -> float:
         """Return the error at these powers, without smoothing of an eigenvalue."""
-        return self.criterion.exact(self.covariances(powers))
+        return self.criterion.compute_exact_error(self.covariances(powers))
 
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
         """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
@@ -143,7 +143,7 @@ class PowerTask(NamedTuple):
         """True if no path has two free hops; then j is concave in its power, and the error convex."""
         return is_convex(self.problem.path)
 
-    def whole(self) -> SplitPaths:
+    def whole_paths(self) -> SplitPaths:
         """Return the paths as functions of the power that their free hops send together."""
         return split_paths(self.problem.paths, self.free, self.fixed)
 
@@ -160,7 +160,7 @@ class PowerTask(NamedTuple):
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
-        envelope = compute_envelope(self.whole(), cap)
+        envelope = compute_envelope(self.whole_paths(), cap)
         return problem._replace(
             path=np.arange(count),
             information=lambda powers: PathInformation(*envelope.information(powers)),
@@ -264,12 +264,12 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there. A criterion
     # with a sharpness is an eigenvalue, not a trace.
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
-        path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole()))
+        path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole_paths()))
         starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]
     powers = problem.solve_from_starts(starts)
     assert powers is not None  # the starts are within the limits
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
-    value, bound = problem.exact(powers), problem.lower_bound(powers)
+    value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
     _, tangent_value, _ = problem.make_support(powers)
     stationarity = max(tangent_value - bound, 0.0) / value
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
@@ -359,7 +359,7 @@ def _check_reachable(task: PowerTask, target: float) -> None:
     # The most that each may send: up to its peak, or plenty, or its whole mean power in one step.
     most = np.minimum(limits.peak, UNLIMITED * np.maximum(task.problem.paths.alpha[:, task.free], 1.0))
     most = np.minimum(most, limits.mean * len(most))
-    left = task.problem.exact(most)
+    left = task.problem.compute_exact_error(most)
     if target <= left * (1 + REACHED):
         what = "power at its limits" if bounded else "unlimited power"
         raise fail("target error", f"more than {left:.6g}: {what} leaves {left:.6g}", f"{target:.6g}")
@@ -384,7 +384,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
     return PowerDesign(
         problem=problem,
         powers=dict(zip(paths.names, of_all_hops.T, strict=True)),
-        error=task.problem.exact(powers),
+        error=task.problem.compute_exact_error(powers),
         certificate=certificate,
         present=present,
         covariance=task.problem.covariances(powers),

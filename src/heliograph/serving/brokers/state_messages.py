@@ -60,7 +60,7 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     estimate = from_json(body)
     moment = estimate["time"]
     time = parse_instant(moment).timestamp() if isinstance(moment, str) else moment
-    dead = _read_dead(estimate)
+    dead = _read_dead_senders(estimate)
     for place, i, message in _iterate_states(topic, states, estimate):
         covariance = message["covariance"]
         variance = None if covariance is None else covariance[i][i]
@@ -82,7 +82,7 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     plant = str(estimate["plant"])
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
-    nodes_with_senders = _read_dead(estimate).keys()
+    nodes_with_senders = _read_dead_senders(estimate).keys()
     for place, i, _ in _iterate_states(topic, states, estimate):
         common = {"state_topic": place.topic, "availability_topic": availability_topic(topic), "device": device}
         for sensor in _list_sensors(place, unit_of(states[i]), place.node in nodes_with_senders):
@@ -116,7 +116,7 @@ def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) ->
     return sensors
 
 
-def _read_dead(estimate: Mapping[str, Any]) -> dict[str, int]:
+def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
     """Return 1 for each node whose sender is dead, 0 for each that lives, by node with such a sender."""
     return {node: int(sender["dead"]) for node, sender in estimate.get("senders", {}).items()}
 

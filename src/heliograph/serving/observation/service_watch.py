@@ -50,7 +50,7 @@ class ServiceAnswers(NamedTuple):
     wrong: int
 
 
-class Watch:
+class ServiceWatch:
     """Observer of any number of services of one network; a call from another thread waits for the current batch.
 
     Args:
@@ -334,8 +334,8 @@ def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, o
     return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}
 
 
-def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> Watch:
-    """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `Watch`."""
+def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> ServiceWatch:
+    """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `ServiceWatch`."""
     claims = network.claims()
     fused = {
         name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
@@ -348,4 +348,4 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> W
     all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
     names |= {(Network.FUSED, name): all_names for name in network.fused}
     unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
-    return Watch(network.states, title, time_unit=unit, fused=fused, names=names, uncounted=uncounted)
+    return ServiceWatch(network.states, title, time_unit=unit, fused=fused, names=names, uncounted=uncounted)
