@@ -20,7 +20,7 @@ from alone import show
 from timeline import readme_network
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.message import read_messages
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store

@@ -20,14 +20,19 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.engine.choice import choose_code
-from heliograph.learning.free_network import Build, describe
-from heliograph.learning.intervals import Method, estimate_long_run_covariance, quantile, sandwich
+from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
+from heliograph.learning.likelihood.parameter_transforms import from_line
 from heliograph.learning.likelihood.surface import DIFFERENCE
-from heliograph.learning.likelihood.transforms import unlink
-from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise
-from heliograph.learning.parameters import Parameters
+from heliograph.learning.likelihood.trust_region import NEAR, Evaluated, maximise_from_starts
+from heliograph.learning.long_run_covariance import (
+    Method,
+    compute_sandwich_covariance,
+    estimate_long_run_covariance,
+    student_quantile,
+)
+from heliograph.learning.parametric_network import Build, describe
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 
 BATCHES, BATCH, RELAYS = 10, 64, 5
@@ -142,12 +147,12 @@ class Fits:
         reach = np.full(self.x.shape, np.nan)
         for i in np.flatnonzero(self.inside):
             result = estimate_long_run_covariance(method, [self.scores[i]], self.hessian[i])
-            spread = np.diag(sandwich(self.hessian[i], result.covariance))
-            reach[i] = quantile(result.freedom) * np.sqrt(np.maximum(spread, 0.0))
+            spread = np.diag(compute_sandwich_covariance(self.hessian[i], result.covariance))
+            reach[i] = student_quantile(result.freedom) * np.sqrt(np.maximum(spread, 0.0))
         return self._back(self.x - reach), self._back(self.x + reach)
 
     def _back(self, x: np.ndarray) -> np.ndarray:
-        columns = [unlink(e.domain, x[:, i]) for i, e in enumerate(self.parameters.entries)]
+        columns = [from_line(e.domain, x[:, i]) for i, e in enumerate(self.parameters.entries)]
         return np.stack(columns, axis=1)
 
 
@@ -172,7 +177,7 @@ def fit_each(network: Build, z: np.ndarray, u: np.ndarray, form: Form) -> Fits:
         return np.asarray(at.density.sum(axis=1)), np.asarray(at.score.sum(axis=1)), np.asarray(at.halves.sum(axis=1))
 
     # Climb from the start, one recording after another: a search goes on with the points that move alone.
-    ends = [maximise(partial(evaluate, data=data[None]), parameters.start[None]) for data in z]
+    ends = [maximise_from_starts(partial(evaluate, data=data[None]), parameters.start[None]) for data in z]
     x, remaining = np.concatenate([end.x for end in ends]), np.concatenate([end.remaining for end in ends])
     top = outcome(x, z)
     hessian = np.asarray(top.halves).sum(axis=1)

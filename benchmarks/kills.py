@@ -20,7 +20,7 @@ from typing import Any
 
 from heliograph.files.network_file import load_network
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.serving.service import Service
 from heliograph.serving.storage.store import Store

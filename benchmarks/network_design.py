@@ -12,8 +12,8 @@ from alone import milliseconds, show
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.budget import make_unlimited
-from heliograph.planning.paths.design import make_power_task
+from heliograph.planning.multihop_paths.design import make_power_task
+from heliograph.planning.power_budget import make_unlimited
 
 SENSORS, STARTS, REPEATS = 20, 30, 20
 ERROR_LIMIT, CONVEX_LIMIT, STARTS_LIMIT = 1.0, 2000.0, 10_000.0

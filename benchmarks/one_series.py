@@ -19,10 +19,10 @@ from peers.environments import python_of
 from peers.series import least
 
 import heliograph as hg
-from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.evaluation import evaluate_at_points
 from heliograph.learning.likelihood.objective import make_objectives
+from heliograph.learning.parametric_network import describe
 
 ROWS = 1_000_000
 FEW = 30_000  # rows that are not divided into chunks

@@ -53,7 +53,7 @@ BORDERS = [
     "filters/wrappers",
     "fusion/mesh",
     "simulation/centres",
-    "planning/paths",
+    "planning/multihop_paths",
     "simulation/runs",
     "files/bags",
     "files/sources",

@@ -152,7 +152,7 @@ from .forecasting.forecast import (
 from .forecasting.backtest import (
     backtest as backtest,
 )
-from .learning.free_network import (
+from .learning.parametric_network import (
     free as free,
 )
 from .learning.fitting import (
@@ -170,7 +170,7 @@ from .export.c_files import (
 from .planning.network_design import (
     design as design,
 )
-from .planning.power import (
+from .planning.sent_power import (
     power as power,
 )
 from .report.progress import (

@@ -8,9 +8,9 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving import LineReader
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore
 from tests.cli.walk import WALK, agrees, kalman, run

@@ -16,7 +16,7 @@ from heliograph import cli
 from heliograph.learning import fitting
 from heliograph.numerics.check import InputError
 from heliograph.serving import LineReader, Pipe
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.message import read_messages
 from tests.cli.walk import WALK, kalman
 from tests.files.module import load_module

@@ -9,8 +9,8 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.files.sources import Sources
 from heliograph.serving import LineReader
-from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.device_status import LastWordsService
+from heliograph.serving.brokers.source_translator import Translator
+from heliograph.serving.device_status import DeviceStatusService
 from heliograph.serving.storage import Store
 
 json_field, Available = hg.files.json_field, hg.files.Available
@@ -160,7 +160,7 @@ def test_a_word_is_kept_over_a_restart(network, tmp_path):
 
     def begun():
         translator = Translator(table(here[0]) | {"other/+": table(here[1:])["zigbee2mqtt/+"]}, network)
-        return translator, LastWordsService(Silent(), translator.sources.device_statuses, store)
+        return translator, DeviceStatusService(Silent(), translator.sources.device_statuses, store)
 
     identity = {"states": "temperature", "description": "{}"}
     value = b'{"temperature": 1}'

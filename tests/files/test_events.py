@@ -11,7 +11,7 @@ import pytest
 import heliograph as hg
 from heliograph import cli
 from heliograph.live.event import Event
-from heliograph.live.recorded import replay_events
+from heliograph.live.event_replay import replay_events
 
 NETWORK = """
 import jax.numpy as jnp

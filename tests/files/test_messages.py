@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import heliograph as hg
-from heliograph.live.recorded import replay_events
+from heliograph.live.event_replay import replay_events
 from tests.files import bags
 from tests.files.module import load_module
 

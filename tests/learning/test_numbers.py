@@ -5,16 +5,21 @@ import pytest
 from scipy import optimize
 
 import heliograph as hg
-from heliograph.learning.intervals import (
-    draw_block_sums,
+from heliograph.learning.likelihood.trust_region import maximise_from_starts
+from heliograph.learning.long_run_covariance import (
+    bootstrap_block_sums,
     estimate_by_bartlett,
     estimate_by_cosines,
     estimate_if_white,
-    find_numbers_told_by_few,
+    find_numbers_told_by_few_stretches,
     remove_predicted_scores,
 )
-from heliograph.learning.likelihood.trust_region import maximise
-from heliograph.learning.unidentified import find_confounded, find_information_rank, format_product, format_sum
+from heliograph.learning.unidentified_directions import (
+    find_confounded,
+    find_information_rank,
+    format_product,
+    format_sum,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -36,17 +41,19 @@ def evaluate(x):
 
 def test_the_climb_ends_where_another_package_ends():
     start = np.array([[0.0, 0.0], [1.0, 1.0], [-1.0, -2.0]])
-    result = maximise(evaluate, start)
+    result = maximise_from_starts(evaluate, start)
     theirs = optimize.least_squares(lambda x: residuals(x[None])[0][0], start[0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert result.converged.all()
     np.testing.assert_allclose(result.x, np.repeat(theirs.x[None], 3, axis=0), atol=1e-7)
 
 
 def test_what_does_not_move_stays_and_the_impossible_is_given_up():
-    fixed = maximise(evaluate, np.array([[0.0, 0.3]]), np.array([[True, False]]))
+    fixed = maximise_from_starts(evaluate, np.array([[0.0, 0.3]]), np.array([[True, False]]))
     assert fixed.converged[0] and fixed.x[0, 1] == 0.3
     assert abs(evaluate(fixed.x)[1][0, 0]) < 1e-6
-    impossible = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
+    impossible = maximise_from_starts(
+        lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2))
+    )
     assert not impossible.converged[0]
 
 
@@ -66,7 +73,7 @@ def test_long_run_covariances_of_an_autoregression():
     assert (
         3.2 < estimate_by_bartlett(scores).covariance[0, 0] / whole < 4.2
     )  # its weights take off lag / (L + 1), L = 13
-    drawn = draw_block_sums(scores, 2000, 0)
+    drawn = bootstrap_block_sums(scores, 2000, 0)
     assert np.var(drawn) / whole == pytest.approx(4.0, rel=0.2)
     assert estimate_by_cosines(scores[:1]).freedom == int(0.4 * steps ** (2 / 3))
     assert estimate_by_cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))
@@ -131,8 +138,8 @@ def test_a_step_is_told_of_by_few_rows_and_a_mean_by_all():
     """Of 100 rows: all at one, all alike, as a chi-square tells, and in the second half."""
     step, half = (np.arange(100) == 50).astype(float), (np.arange(100) >= 50).astype(float)
     columns = [step, np.ones(100), np.random.default_rng(0).normal(size=100) ** 2, half]
-    assert find_numbers_told_by_few([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
-    assert not find_numbers_told_by_few([np.ones((40, 1)), np.ones((60, 1))]).any()
+    assert find_numbers_told_by_few_stretches([np.stack(columns, axis=1)]).tolist() == [True, False, False, False]
+    assert not find_numbers_told_by_few_stretches([np.ones((40, 1)), np.ones((60, 1))]).any()
 
 
 def test_of_a_true_model_the_parts_of_scores_add_up_to_its_information():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.likelihood.trust_region import maximise
+from heliograph.learning.likelihood.trust_region import maximise_from_starts
 from heliograph.learning.likelihood.trust_region_step import trust_region_step
 
 NATS = 1e-3  # below another search
@@ -151,7 +151,7 @@ def test_steps_go_up_where_single_coordinates_would_turn_them():
         return -np.einsum("li,ij,lj->l", x, curvature, x) / 2, -x @ curvature, np.repeat(curvature[None], len(x), 0)
 
     seen = []
-    end = maximise(evaluate, np.array([[-1000.0, 400.0]]), None, lambda now: seen.append(now.total[0]))
+    end = maximise_from_starts(evaluate, np.array([[-1000.0, 400.0]]), None, lambda now: seen.append(now.total[0]))
     assert end.converged.all() and np.all(np.diff(seen) >= 0) and end.total[0] > -1e-12
 
 
@@ -175,7 +175,7 @@ def two_tops(counts):
 def test_lanes_before_one_top_are_climbed_by_one(joining):
     """Three lanes end at one top and one at the other; those that are left to another one are asked no more."""
     counts, starts = [], np.array([[2.0, 2.0], [0.6, 0.7], [1.1, 0.9], [-2.0, -1.0]])
-    found = maximise(two_tops(counts), starts, joining=joining)
+    found = maximise_from_starts(two_tops(counts), starts, joining=joining)
     assert found.converged.all() and found.total == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(found.x[:, 0], [1, 1, 1, -1], atol=1e-6)
     assert (len({tuple(x) for x in found.x}) == 2) == joining
@@ -184,7 +184,7 @@ def test_lanes_before_one_top_are_climbed_by_one(joining):
 
 def test_lanes_on_both_sides_of_a_saddle_stay_apart():
     """They are a hundredth of a standard error from each other, as high and flat, and end at different tops."""
-    found = maximise(two_tops([]), np.array([[1e-4, 1e-4], [-1e-4, -1e-4]]), joining=True)
+    found = maximise_from_starts(two_tops([]), np.array([[1e-4, 1e-4], [-1e-4, -1e-4]]), joining=True)
     np.testing.assert_allclose(found.x[:, 0], [1, -1], atol=1e-6)
 
 
@@ -194,7 +194,7 @@ def test_a_gradient_that_the_information_overstates_is_climbed_to_the_end():
     def evaluate(x):
         return -np.sum(x**2, axis=1) / 2, -x, np.repeat(1000 * np.eye(2)[None], len(x), 0)
 
-    end = maximise(evaluate, np.array([[3.0, -2.0]]))
+    end = maximise_from_starts(evaluate, np.array([[3.0, -2.0]]))
     assert end.converged.all() and np.abs(end.x).max() < 1e-4 and end.steps < 50
 
 

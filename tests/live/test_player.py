@@ -6,7 +6,7 @@ import jax
 import pytest
 
 import heliograph as hg
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.simulation.runs import StackedFilters
 from tests.live import worlds
 

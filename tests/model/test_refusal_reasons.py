@@ -7,9 +7,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.report import examine, run_page, run_summary
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.observation import watch_of
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from heliograph.planning import independent_paths
-from heliograph.planning.paths.model import Paths
+from heliograph.planning.multihop_paths.model import Paths
 
 PLANT = (np.array([[0.95, 0.1, 0], [0, 0.9, 0.2], [0, -0.1, 0.8]]), np.diag([0.1, 0.05, 0.2]))
 ROWS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, -1], [1, 0, 1]], dtype=float)

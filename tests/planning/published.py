@@ -4,8 +4,8 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.budget import make_unlimited
-from heliograph.planning.paths import make_power_task
+from heliograph.planning.multihop_paths import make_power_task
+from heliograph.planning.power_budget import make_unlimited
 
 A = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 Q = np.diag([0.1, 0.05, 0.2])

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error, paths_of
-from heliograph.planning.paths.model import compute_path_information
+from heliograph.planning.multihop_paths.model import compute_path_information
 from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, path_problem, two_hops
 
 
@@ -40,7 +40,7 @@ def test_one_hop_reaches_the_example(single, total):
     assert result.certificate.convex and result.certificate.gap < 1e-12
     paths, _ = paths_of(single, Error())
     problem = path_problem(paths, Error(), np.eye(3), np.ones(6, dtype=bool), np.zeros((1, 6)))
-    even = problem.exact(np.full((1, 6), total / 6))
+    even = problem.compute_exact_error(np.full((1, 6), total / 6))
     assert even == pytest.approx(equal, abs=1e-8)
     cheap = hg.design(single, target_error=even)
     assert cheap.error == pytest.approx(even, rel=1e-12) and cheap.total == pytest.approx(least, abs=5e-5)

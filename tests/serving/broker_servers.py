@@ -14,8 +14,8 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.serving import make_transport
+from heliograph.serving.brokers.broker_address import Address, parse_address
 from heliograph.serving.brokers.transport import Part, Transport, encode_name
-from heliograph.serving.brokers.url import Address, parse_address
 from heliograph_studies.live.server import Server
 
 KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]

@@ -11,8 +11,8 @@ import pytest
 import heliograph as hg
 from heliograph.live.stored import PlantMigration
 from heliograph.serving.service import Service
-from heliograph.serving.storage import Store, identity, report_damage
-from heliograph.serving.storage.store_protocol import Damage
+from heliograph.serving.storage import Store, describe_damaged_plants, identity
+from heliograph.serving.storage.store_protocol import DamagedRow
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 SENT = lines(messages(2, 24, seed=11, whole=True))
@@ -142,10 +142,10 @@ def test_nothing_begins_anew_where_a_name_is_damaged(whole, tmp_path, mine, name
 
 
 def test_damage_is_one_line_with_what_to_do():
-    named = Damage(True, 0)
-    assert report_damage({"a": named, "": named}).endswith("(--anew a --anew '')")
-    assert "lost its name" in report_damage({"a": named, "b": Damage(False, 0)})
-    assert report_damage({f"p{i}": named for i in range(13)}).endswith("--anew p9 and 3 more)")
+    named = DamagedRow(True, 0)
+    assert describe_damaged_plants({"a": named, "": named}).endswith("(--anew a --anew '')")
+    assert "lost its name" in describe_damaged_plants({"a": named, "b": DamagedRow(False, 0)})
+    assert describe_damaged_plants({f"p{i}": named for i in range(13)}).endswith("--anew p9 and 3 more)")
 
 
 @pytest.mark.parametrize(

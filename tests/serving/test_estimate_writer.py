@@ -7,7 +7,7 @@ import pytest
 from pydantic_core import to_json
 
 import heliograph as hg
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.estimate_writer import EstimateWriter
 from tests.losing import Losing
 from tests.serving.worlds import fleet, stepping

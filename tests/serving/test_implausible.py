@@ -75,7 +75,7 @@ def test_limits_hold_here_too_and_it_is_said_once():
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
     said = []
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.network_program import NetworkProgram
+    from heliograph.live.network_step_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore(), said.append)
     sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
@@ -99,7 +99,7 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
     network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
     from heliograph.live.fleet import Fleet, Options
-    from heliograph.live.network_program import NetworkProgram
+    from heliograph.live.network_step_program import NetworkProgram
 
     service = Service(Fleet(NetworkProgram(network), Options(5.0)), InMemoryStore())
     (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))

@@ -16,9 +16,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
-from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.url import parse_address
+from heliograph.live.network_step_program import NetworkProgram
+from heliograph.serving.brokers.broker_address import parse_address
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.message import Message
 from heliograph.serving.service import Service
 from heliograph.serving.settings import ServiceSettings, settings_of_node

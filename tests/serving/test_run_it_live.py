@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from heliograph import cli
 from heliograph.serving.message import Message
 from heliograph.serving.output import Estimates, Refused
-from heliograph.serving.settings import choose_store
+from heliograph.serving.settings import choose_store_location
 from tests.serving.worlds import lines, messages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -148,8 +148,8 @@ def test_a_store_is_called_as_its_network():
         ("pack.cart:b", "cart-b.db"),
         ("pack.cart", "cart.db"),
     ):
-        assert choose_store(network, None, None) == name
-    assert choose_store("cart.py", None, 3) is None and choose_store("cart.py", "x.db", 3) == "x.db"
+        assert choose_store_location(network, None, None) == name
+    assert choose_store_location("cart.py", None, 3) is None and choose_store_location("cart.py", "x.db", 3) == "x.db"
 
 
 def test_what_serve_and_replay_refuse_is_one_line(tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 import heliograph as hg
 from heliograph.live import LinkCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving.observation import watch_of
 from heliograph.serving.output import Estimates, Refused
 from heliograph.serving.service import Service

@@ -21,7 +21,7 @@ from sqlalchemy import Engine, update
 import heliograph
 from heliograph.serving.brokers.transport import encode_name
 from heliograph.serving.service import Service
-from heliograph.serving.storage import InMemoryStore, Leases, leases, open_database
+from heliograph.serving.storage import InMemoryStore, Leases, open_database, part_leases
 from heliograph_studies.live.server import Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 
@@ -47,7 +47,7 @@ def shared(engine: Engine) -> None:
     assert three.renew() == {2} and item.renew() == {0, 1}
     two.leave()
     with engine.begin() as connection:  # one and three died, and it is longer ago than a lease lasts
-        for table in (leases.PROCESSES, leases.PARTS):
+        for table in (part_leases.PROCESSES, part_leases.PARTS):
             connection.execute(update(table).values(until=table.c.until - 601.0))
     two.release(0)  # what is not one's own stays
     assert two.renew() == {0, 1, 2, 3, 4} and item.renew() == set()

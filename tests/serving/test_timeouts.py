@@ -92,7 +92,7 @@ def test_silence_of_one_is_told_with_what_the_other_sends(program, clock, tmp_pa
 
 
 def test_a_silent_plant_is_told_while_others_send_unless_messages_wait(program, clock, tmp_path, monkeypatch):
-    monkeypatch.setattr("heliograph.serving.silence.SHORTEST", -1.0)  # a look after each batch, not once a second
+    monkeypatch.setattr("heliograph.serving.silent_senders.SHORTEST", -1.0)  # a look after each batch
     service = begun(program, tmp_path / "a.db")
     send(service, 0.0, "a", 0, "silent")
     clock.seconds = 60.0
@@ -111,7 +111,7 @@ def test_after_a_restart_it_is_told_again_and_the_page_and_metrics_know(program,
     watched = watch.wrap(again)
     clock.seconds = 30.0
     assert watched.take([]) == []  # messages that waited come first
-    monkeypatch.setattr("heliograph.serving.silence.GRACE", -1.0)
+    monkeypatch.setattr("heliograph.serving.silent_senders.GRACE", -1.0)
     assert dead(watched.take([])) == ["nothing came for 30 s, and its timeout is 5 s"]
     warnings = ["a: its sender is dead: nothing came for 30 s, and its timeout is 5 s"]
     assert watch.make_page_data("p")["warnings"] == warnings

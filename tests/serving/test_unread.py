@@ -6,7 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.serving import LineReader
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore
 from tests.serving.worlds import fleet, lines, moving

@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
 HOP = hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)

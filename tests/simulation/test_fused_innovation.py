@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 
 F, Q = np.array([[1.0, 1.0], [0.0, 0.9]]), np.diag([0.01, 0.1])
 ROWS, NOISES = ([1.0, 0.0], [0.5, 1.0]), (0.5, 2.0)

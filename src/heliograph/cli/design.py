@@ -49,7 +49,7 @@ def design(
 
 def count_stages(file: "DesignFile") -> int:
     """Return the approximate number of steps for the progress bar."""
-    from heliograph.planning.comparisons import POINTS
+    from heliograph.planning.design_comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)
     return 1 + rows + len(file.front or range(POINTS)) + 3 * len(file.network.nodes)
@@ -58,8 +58,8 @@ def count_stages(file: "DesignFile") -> int:
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
     import heliograph as hg
-    from heliograph.files.design_file import make_designed_source
-    from heliograph.planning.comparisons import totals_about
+    from heliograph.files.design_file import write_designed_source
+    from heliograph.planning.design_comparisons import list_totals_about
     from heliograph.report.pages.design import SOURCE, DesignResults
 
     # The design, and the powers before it.
@@ -67,7 +67,7 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     best = hg.design(file.problem)
     before = hg.power(file.network, best.problem.criterion.horizon).mean
     # Further results, each with its own progress.
-    sites, totals = file.map, file.front or totals_about(best.total)
+    sites, totals = file.map, file.front or list_totals_about(best.total)
     return DesignResults(
         reference=file.reference,
         source=file.source,

@@ -229,7 +229,7 @@ def _write_lagged_estimates(
     """
     if lag is None or data.events is None:
         return []
-    from heliograph.live.recorded import replay_events
+    from heliograph.live.event_replay import replay_events
     from heliograph.model.plant import TIME_STEP
 
     window, ahead = options.limits

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from heliograph.files.recording import Recording
     from heliograph.learning import Fit, Share
-    from heliograph.learning.held_out import Change, Uniformity
-    from heliograph.learning.losses.losses import Losses
-    from heliograph.learning.losses.packet_fates import Fates
+    from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
+    from heliograph.learning.packet_losses.learn_losses import Losses
+    from heliograph.learning.packet_losses.packet_fates import Fates
     from heliograph.report.pages.fit import FitResults
     from heliograph.report.progress import Advance
     from heliograph.report.results_folder import Json, ResultsContent
@@ -106,7 +106,7 @@ def fit_and_judge(
     from dataclasses import replace
 
     from heliograph.files.fitted import NetworkAgain
-    from heliograph.learning.held_out import compare_filters, transform_held_out
+    from heliograph.learning.held_out_comparison import compare_before_and_after, transform_held_out
     from heliograph.learning.sender_fit import has_deciding_sender
     from heliograph.numerics.check import fail
     from heliograph.report.pages.fit import FitResults
@@ -128,10 +128,10 @@ def fit_and_judge(
     # laws hold there: the probability integral transforms of those rows are uniform then.
     z, u = recording.measurements, recording.inputs
     advance("judging on held-out rows")
-    changes: list[Change] = []
-    uniform: list[Uniformity] = []
+    changes: list[PredictionBeforeAndAfter] = []
+    uniform: list[HeldOutTransforms] = []
     if learned_rows < rows:
-        changes = stop.run_unless_stopped(lambda: compare_filters(start, fitted.network, z, u, learned_rows)) or []
+        changes = stop.unless_stopped(lambda: compare_before_and_after(start, fitted.network, z, u, learned_rows)) or []
     if changes:
         uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
     # The law of lost messages, by node of which some were lost.
@@ -142,7 +142,7 @@ def fit_and_judge(
 
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
-    from heliograph.learning.losses.losses import learn_losses
+    from heliograph.learning.packet_losses.learn_losses import learn_losses
 
     fates = _find_message_fates(network, recording)
     lossy = {name for name, sequences in fates.items() if any(0 < sequence.mean() < 1 for sequence in sequences)}
@@ -155,7 +155,7 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     Nodes are left out of which nobody knows when a message is due. Those are nodes without a rate of their own, where
     each row is a message of one node.
     """
-    from heliograph.learning.losses.packet_fates import fates_of_measurements, fates_of_sequence
+    from heliograph.learning.packet_losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.arrivals import list_arrivals
 
     fates = fates_of_measurements(recording.measurements)

@@ -75,13 +75,18 @@ class ServeOptions:
         from heliograph.files.network_file import load_module
         from heliograph.live.fleet import Options
         from heliograph.numerics.times.dates import horizons_in
-        from heliograph.serving.brokers.url import parse_address
-        from heliograph.serving.settings import ServiceSettings, choose_store, name_of_network, settings_of_node
+        from heliograph.serving.brokers.broker_address import parse_address
+        from heliograph.serving.settings import (
+            ServiceSettings,
+            choose_store_location,
+            name_of_network,
+            settings_of_node,
+        )
         from heliograph.serving.thresholds import parse_threshold
 
         # Addresses are checked before the network is loaded.
         broker = None if self.broker is None else parse_address(self.broker)
-        store = choose_store(reference, self.store, self.parts, self.node)
+        store = choose_store_location(reference, self.store, self.parts, self.node)
         network, module = load_module(reference)
         settings = ServiceSettings(
             network=network,
@@ -112,8 +117,8 @@ class ServeOptions:
             ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.
         """
         from heliograph.numerics.check import fail
+        from heliograph.serving.brokers.broker_address import parse_address
         from heliograph.serving.brokers.state_topics import StateTopics
-        from heliograph.serving.brokers.url import parse_address
 
         if self.states is None:
             if self.discovery:
@@ -144,9 +149,9 @@ def serve(network: str | None = None, /, *, options: ServeOptions | None = None)
     import json
 
     from heliograph.numerics.check import fail
-    from heliograph.serving.assembly import run
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
+    from heliograph.serving.service_assembly import run_service
 
     requested = ServeOptions() if options is None else options
     # The schema needs no network.
@@ -155,4 +160,4 @@ def serve(network: str | None = None, /, *, options: ServeOptions | None = None)
         return
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
-    asyncio.run(run(requested.settings(network)))
+    asyncio.run(run_service(requested.settings(network)))

@@ -11,9 +11,9 @@ import numpy as np
 
 from heliograph.files.network_file import load_function, load_network
 from heliograph.numerics.check import array, check_count, check_seed, fail, scalar
-from heliograph.planning.budget import Budget
+from heliograph.planning.design_problem import DesignProblem
 from heliograph.planning.error_objective import Error
-from heliograph.planning.problem import DesignProblem
+from heliograph.planning.power_budget import Budget
 from heliograph.simulation.network import Network
 
 KEYS = ("network", "free", "budget", "target_error", "error", "starts", "seed", "front", "path_loss_exponent", "map")

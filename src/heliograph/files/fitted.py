@@ -11,8 +11,8 @@ import numpy as np
 
 from heliograph.files.network_file import load_network
 from heliograph.learning.fitting import Fit
-from heliograph.learning.free_network import describe
-from heliograph.learning.losses.delays import Delays
+from heliograph.learning.packet_losses.delay_law import Delays
+from heliograph.learning.parametric_network import describe
 from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.network import Network
 

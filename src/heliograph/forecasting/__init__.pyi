@@ -1,10 +1,10 @@
 """Public names of the room; the package loads them when first used."""
 
-from .paths import (
+from .sample_paths import (
     Paths as Paths,
     draw_paths as draw_paths,
 )
-from .threshold import (
+from .threshold_crossing import (
     Crossing as Crossing,
     crossing as crossing,
 )
@@ -12,12 +12,12 @@ from .backtest import (
     Backtest as Backtest,
     Score as Score,
 )
-from .disturbances import (
+from .auxiliary_residuals import (
     Disturbances as Disturbances,
     Shock as Shock,
     disturbances as disturbances,
 )
-from .one_step import (
+from .one_step_predictions import (
     predict_record as predict_record,
     predict_rows as predict_rows,
 )
@@ -26,7 +26,7 @@ from .residual_tests import (
     record_residuals as record_residuals,
     residuals as residuals,
 )
-from .prediction import (
+from .forecast_result import (
     Forecast as Forecast,
     Prediction as Prediction,
 )

@@ -12,7 +12,7 @@ from typing_extensions import TypeAliasType
 from heliograph.engine.choice import compute_once
 from heliograph.filters.angle_indices import FilterAngles
 from heliograph.forecasting.forecast import ForecastTarget, list_targets
-from heliograph.forecasting.outlook import Moments, Outlook
+from heliograph.forecasting.multistep_prediction import Moments, MultistepPredictor
 from heliograph.forecasting.scores import (
     LEVELS,
     MixtureLaws,
@@ -178,19 +178,21 @@ def backtest(
     networks = {0: network}
     if refit is not None:
         starts = range(first, rows, check_count("every", every))
-        networks = {row: _refit(refit, row, network) for row in starts}
+        networks = {row: _call_refit(refit, row, network) for row in starts}
     # The filters of each network, in one order; then the scores of each filter over the rows of all networks.
-    origins = [_find_origin(fitted, record, measurements, inputs, time, truth) for fitted in networks.values()]
+    origins = [
+        _find_start_of_forecasts(fitted, record, measurements, inputs, time, truth) for fitted in networks.values()
+    ]
     scores = list[Score]()
     for of_filter in zip(*(list_targets(origin) for origin in origins), strict=True):
-        if (of_filter[0].node, of_filter[0].filter) in list_filtered_places(network):
+        if (of_filter[0].node, of_filter[0].filter) in list_single_filters(network):
             scores += _score_filter(list(zip(networks, of_filter, strict=True)), record, u, ahead, first)
     if not scores:
         raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
     return Backtest(tuple(ahead), rows, tuple(scores))
 
 
-def _refit(refit: Refit, rows: int, network: Network) -> Network:
+def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
     """Return the network as it is known from so many first rows, by the user's function `refit`.
 
     Raises:
@@ -202,7 +204,7 @@ def _refit(refit: Refit, rows: int, network: Network) -> Network:
     return fitted
 
 
-def _find_origin(network: Network, record: Record, *data: Any) -> Origin:
+def _find_start_of_forecasts(network: Network, record: Record, *data: Any) -> Origin:
     """Return where a network's forecasts start; it is run over the data where the record is not its own."""
     origin = record.origin
     if not isinstance(origin, Origin) or origin.model is not network:
@@ -211,7 +213,7 @@ def _find_origin(network: Network, record: Record, *data: Any) -> Origin:
     return origin
 
 
-def list_filtered_places(network: Network) -> set[tuple[str, str]]:
+def list_single_filters(network: Network) -> set[tuple[str, str]]:
     """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.places) | central
@@ -338,7 +340,7 @@ def _score_number(
 
 
 def roll_forecasts(
-    outlook: Outlook, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
+    outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
 ) -> tuple[Moments, Moments | None]:
     """Return forecasts from each row at each horizon: of the states, and of what would arrive.
 
@@ -354,7 +356,7 @@ def roll_forecasts(
 
 
 def _forecast_from_each_row(
-    outlook: Outlook, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
+    outlook: MultistepPredictor, z: jax.Array, u: jax.Array, windows: jax.Array, places: jax.Array
 ) -> PyTree:
     """Return the moments that a filter forecasts from each row of a recording: of the states, and of what arrives.
 

@@ -8,19 +8,19 @@ import numpy as np
 
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
-from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_ahead, find_rows_ahead
-from heliograph.forecasting.origins import Sources, find_common_origin
-from heliograph.forecasting.outlook import (
-    Outlook,
+from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.forecasting.forecast_result import Forecast
+from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
+from heliograph.forecasting.multistep_prediction import (
+    MultistepPredictor,
     find_output_claim,
-    look_ahead,
-    look_ahead_of_each,
-    make_outlook,
-    prediction_of,
+    make_multistep_predictor,
+    make_prediction,
+    predict_moments,
+    predict_moments_of_each,
 )
-from heliograph.forecasting.prediction import Forecast
-from heliograph.model.augmented.joint_sensors import joint_sensor
+from heliograph.forecasting.start_states import Sources, find_common_origin
+from heliograph.model.enlarged.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
@@ -75,7 +75,7 @@ def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> 
     ahead = find_rows_ahead(origin, model.inputs, horizons, inputs)
     forecasts: Forecasts = {}
     for target in list_targets(origin):
-        check_covered(target.outlook.filter, origin.step, ahead.u.shape[-2])
+        check_steps_covered(target.outlook.filter, origin.step, ahead.u.shape[-2])
         forecasts.setdefault(target.node, {})[target.filter] = _forecast_target(target, origin, ahead)
     return forecasts
 
@@ -85,7 +85,7 @@ class ForecastTarget(NamedTuple):
 
     node: str
     filter: str
-    outlook: Outlook
+    outlook: MultistepPredictor
     state: PyTree
     received: tuple[str, ...]
 
@@ -112,7 +112,7 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     """
     model = origin.model
     if isinstance(model, AbstractFilter):
-        outlook = make_outlook(model)
+        outlook = make_multistep_predictor(model)
         outputs = () if outlook.sensor is None else tuple(first(outlook.sensor).outputs)
         received = name_values(outputs, model.received)
         return [ForecastTarget(node="", filter="", outlook=outlook, state=origin.state, received=received)]
@@ -121,7 +121,7 @@ def list_targets(origin: Origin) -> list[ForecastTarget]:
     for node, filters in origin.estimates.items():
         for name, estimate in filters.items():
             filter, state = _find_filter(model, origin, node, name, estimate)
-            outlook = make_outlook(filter, _find_sensor(model, node), model.plant)
+            outlook = make_multistep_predictor(filter, _find_sensor(model, node), model.plant)
             received = _name_received(model, node)
             targets.append(ForecastTarget(node=node, filter=name, outlook=outlook, state=state, received=received))
     return targets
@@ -144,7 +144,7 @@ def _find_filter(
         # The states of a kind are stacked filter by filter, and for each over the nodes of its group.
         kind, filter_of_kind, node_of_group = network.places[node, name]
         place = filter_of_kind * len(network.groups[network.kinds[kind].group]) + node_of_group
-        return network.nodes[node].filters[name], _take_state(by_kind[kind], place, origin.several)
+        return network.nodes[node].filters[name], _take_stacked_state(by_kind[kind], place, origin.several)
     if name in central:
         filter = network.fused[name]
         assert isinstance(filter, AbstractFilter)
@@ -152,7 +152,7 @@ def _find_filter(
     return _predict_without_nodes(network, estimate)
 
 
-def _take_state(stacked: PyTree, place: int, several: bool) -> PyTree:
+def _take_stacked_state(stacked: PyTree, place: int, several: bool) -> PyTree:
     """Return one of the states of filters that are stacked along the first axis, or if `several` plants the second."""
     return jax.tree.map(lambda leaf: np.take(leaf, place, axis=int(several)), stacked)
 
@@ -190,7 +190,7 @@ def _name_received(network: Network, node: str) -> tuple[str, ...]:
     return tuple(f"{name}_{part}" for name in network.names for part in network.nodes[name].received_names)
 
 
-def check_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
+def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
     """Raise ValueError where what varies over time ends before `count` steps ahead of `step`."""
     last = int(np.max(step))
     if filter.horizon is not None and last + count > filter.horizon:
@@ -204,21 +204,21 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     `ahead`: inputs of the rows ahead, and the row of each horizon.
     """
     outlook, filter = target.outlook, target.outlook.filter
-    check_ahead(filter.inputs, ahead, filter, origin.step)
-    look = look_ahead_of_each if origin.several else look_ahead
+    check_inputs_ahead(filter.inputs, ahead, filter, origin.step)
+    look = predict_moments_of_each if origin.several else predict_moments
     moments = look(outlook, target.state, ahead.u, origin.step)
     states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
     claim = filter.claim
-    measured = outputs and prediction_of(
+    measured = outputs and make_prediction(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, target.received, claim, angles.received)
+    arriving = received and make_prediction(received, target.received, claim, angles.received)
     return Forecast(
         steps=ahead.steps,
         time=ahead.time,
-        states=prediction_of(states, filter.states, claim, angles.states),
+        states=make_prediction(states, filter.states, claim, angles.states),
         outputs=measured,
         received=arriving,
         inputs=ahead.inputs,

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.forecasting.prediction import InputsAhead
-from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.forecasting.forecast_result import InputsAhead
+from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_count, fail, is_whole, rank, show_value
@@ -85,7 +85,7 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     A whole number stands for each step up to it.
     """
     if is_whole(horizons):
-        return np.arange(1.0, _check_steps(horizons) + 1)
+        return np.arange(1.0, _require_step_count(horizons) + 1)
     return np.array([_convert_horizon_to_steps(origin, horizon) for horizon in _list_horizons(horizons)])
 
 
@@ -97,7 +97,7 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     """
     seconds = _convert_to_seconds(origin, horizon)
     if seconds is None:  # a number
-        return float(_check_steps(horizon))
+        return float(_require_step_count(horizon))
     # Steps of whole months are not of equal length.
     if origin.months and isinstance(horizon, datetime | np.datetime64):
         return _count_months(origin, horizon)
@@ -127,7 +127,7 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     if is_whole(horizons):
         if not origin.spacing > 0:
             raise fail("horizons", "times ahead, such as [1.0, 5.0], where no step is usual", horizons)
-        return origin.spacing * np.arange(1, _check_steps(horizons) + 1)
+        return origin.spacing * np.arange(1, _require_step_count(horizons) + 1)
     times = []
     for horizon in _list_horizons(horizons):
         seconds = _convert_to_seconds(origin, horizon)
@@ -135,7 +135,7 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     return np.array(times)
 
 
-def _check_steps(value: object) -> int:
+def _require_step_count(value: object) -> int:
     """Return a count of steps ahead; raise if there are too many."""
     count = check_count("horizons", value)
     if count > LONGEST:
@@ -219,7 +219,7 @@ def _complete_inputs(
     return np.repeat(last[..., None, :], count, axis=-2), "held"
 
 
-def check_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
+def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
     """Raise ValueError at inputs ahead for which a function of the models returns what it must not.
 
     `names`: of the inputs; `step`: that of the last row, of several plants for each.

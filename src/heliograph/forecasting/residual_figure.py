@@ -17,7 +17,7 @@ WIDTH, HEIGHT_OF_TITLES, HEIGHT_OF_ROW = 9.0, 0.5, 1.9  # inches
 TWO_DEVIATIONS = 2  # about which 95 % of normal residuals lie
 
 
-class Quantiles(NamedTuple):
+class ResidualQuantiles(NamedTuple):
     """Residuals in order, beside what they would be of a normal law.
 
     Args:
@@ -33,13 +33,13 @@ class Quantiles(NamedTuple):
     high: np.ndarray
 
 
-def compare_quantiles(e: np.ndarray) -> Quantiles:
+def compare_with_normal_quantiles(e: np.ndarray) -> ResidualQuantiles:
     """Return the quantiles of residuals (steps,), NaN where none came: the i-th of n is Beta(i, n + 1 - i) in law."""
     came = np.sort(e[~np.isnan(e)])
     n = len(came)
     place = np.arange(1, n + 1)
     low, high = (np.asarray(ndtri(beta.ppf(p, place, n + 1 - place))) for p in (OUTSIDE, 1 - OUTSIDE))
-    return Quantiles(normal=ndtri(place / (n + 1)), residuals=came, low=low, high=high)
+    return ResidualQuantiles(normal=ndtri(place / (n + 1)), residuals=came, low=low, high=high)
 
 
 def draw_residuals(
@@ -69,7 +69,7 @@ def draw_residuals(
         over_time.set_ylabel(names[i])
         by_lag.bar(lags, autocorrelation[:, i], 0.5, color=COLOURS[0])
         by_lag.axhspan(-band[i], band[i], color="0.85", zorder=0)
-        quantiles = compare_quantiles(values[:, i])
+        quantiles = compare_with_normal_quantiles(values[:, i])
         in_order.fill_between(quantiles.normal, quantiles.low, quantiles.high, color="0.85", linewidth=0)
         in_order.plot(quantiles.normal, quantiles.residuals, ".", markersize=3, color=COLOURS[0])
         for panel in (over_time, by_lag, in_order):

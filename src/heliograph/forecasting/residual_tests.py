@@ -10,10 +10,10 @@ from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import select_measurements
 from heliograph.forecasting.forecast import list_targets
-from heliograph.forecasting.one_step import predict_record, predict_rows
-from heliograph.forecasting.origins import origin_of
-from heliograph.forecasting.prediction import Array, Forecast
-from heliograph.forecasting.residual_figure import Quantiles, compare_quantiles, draw_residuals
+from heliograph.forecasting.forecast_result import Array, Forecast
+from heliograph.forecasting.one_step_predictions import predict_record, predict_rows
+from heliograph.forecasting.residual_figure import ResidualQuantiles, compare_with_normal_quantiles, draw_residuals
+from heliograph.forecasting.start_states import find_origin
 from heliograph.numerics.angle import Angles, wrap_near
 from heliograph.numerics.check import check_count, fail, instance, show_value
 from heliograph.numerics.module import readable
@@ -68,7 +68,7 @@ class Residuals:
             if p[i] < FALSE / made
         ]
 
-    def quantiles(self, name: str) -> Quantiles:
+    def quantiles(self, name: str) -> ResidualQuantiles:
         """Return the residuals of one output in order, beside the quantiles of a normal law, with a band of 95 % each.
 
         Raises:
@@ -76,7 +76,7 @@ class Residuals:
         """
         if name not in self.names:
             raise fail("output", f"one of {', '.join(self.names)}", show_value(name))
-        return compare_quantiles(self.values[:, self.names.index(name)])
+        return compare_with_normal_quantiles(self.values[:, self.names.index(name)])
 
     def figure(self, time: "Float[ArrayLike, ' steps'] | None" = None) -> "Figure":
         """Return a figure: of each output residuals over time, autocorrelations with their band, and quantiles.
@@ -142,7 +142,7 @@ def record_residuals(
     """
     predicted = predict_record(record, inputs)
     found: dict[str, dict[str, Residuals]] = {}
-    for target in list_targets(origin_of(record)):
+    for target in list_targets(find_origin(record)):
         prediction = predicted.get(target.node, {}).get(target.filter)
         if prediction is None:
             continue

@@ -1,6 +1,6 @@
 """Public names of the room; the package loads them when first used."""
 
-from .held_out import (
+from .held_out_comparison import (
     Comparison as Comparison,
     compare_laws as compare_laws,
 )
@@ -8,44 +8,44 @@ from .likelihood.predictive_density import (
     Predictive as Predictive,
     predictive as predictive,
 )
-from .losses.delays import (
+from .packet_losses.delay_law import (
     Delays as Delays,
 )
-from .losses.loss_law import (
+from .packet_losses.loss_laws import (
     AbstractLossLaw as AbstractLossLaw,
 )
-from .losses.losses import (
+from .packet_losses.learn_losses import (
     LossMemory as LossMemory,
     Losses as Losses,
     learn_losses as learn_losses,
 )
-from .losses.probability_intervals import (
+from .packet_losses.probability_intervals import (
     Share as Share,
 )
-from .losses.packet_fates import (
+from .packet_losses.packet_fates import (
     fates_by_hop as fates_by_hop,
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,
     fates_of_sequence as fates_of_sequence,
 )
-from .inference import (
+from .hypothesis_tests import (
     FitTest as FitTest,
 )
 from .fitting import (
     Fit as Fit,
 )
-from .identification import (
+from .identifiability import (
     Identifiability as Identifiability,
     identifiable as identifiable,
 )
-from .parameters import (
+from .free_parameters import (
     Parameters as Parameters,
 )
-from .free_network import (
+from .parametric_network import (
     Description as Description,
     describe as describe,
 )
-from .likelihood_maximum import (
+from .estimate_table import (
     Row as Row,
 )
 from .samples_to_decide import (

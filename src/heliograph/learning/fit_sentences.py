@@ -2,14 +2,16 @@
 
 import numpy as np
 
-from heliograph.learning.likelihood_maximum import Solution
+from heliograph.learning.estimate_table import Solution
 from heliograph.numerics.types import Float
 
 ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
 APART = 3.0  # standard errors between the two forms that suggest an error of the model
 
 
-def describe_climb(solutions: tuple[Solution, ...], ends: Float[np.ndarray, " starts"], stopped: bool) -> list[str]:
+def describe_unfinished_climbs(
+    solutions: tuple[Solution, ...], ends: Float[np.ndarray, " starts"], stopped: bool
+) -> list[str]:
     """Return the sentences on climbs that were stopped, did not converge, or ended below the best.
 
     Args:
@@ -38,7 +40,7 @@ def describe_boundaries(best: Solution) -> list[str]:
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 
-def describe_forms(solutions: tuple[Solution, ...]) -> list[str]:
+def describe_form_conflict(solutions: tuple[Solution, ...]) -> list[str]:
     """Return a sentence on each number on which the two forms of the likelihood disagree beyond their errors."""
     if len(solutions) < 2:
         return []

@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from heliograph.learning.fit_sentences import describe_boundaries, describe_climb, describe_forms
-from heliograph.learning.free_network import Build, Description, describe
-from heliograph.learning.identification import Identifiability, identify_by_recording
-from heliograph.learning.inference import FitTest, Values, compare_likelihoods, information_criteria, wald_test
-from heliograph.learning.inference_data import make_inference_data
-from heliograph.learning.intervals import LEVEL, METHODS, Method
+from heliograph.learning.arviz_inference_data import make_inference_data
+from heliograph.learning.estimate_table import Row, Solution
+from heliograph.learning.fit_sentences import describe_boundaries, describe_form_conflict, describe_unfinished_climbs
+from heliograph.learning.hypothesis_tests import FitTest, Values, compare_likelihoods, compute_criteria, wald_test
+from heliograph.learning.identifiability import Identifiability, identify_by_recording
 from heliograph.learning.likelihood.data import gather_data
 from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
 from heliograph.learning.likelihood.objective import Form, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import Maximum
-from heliograph.learning.likelihood_maximum import Row, Solution
-from heliograph.learning.losses.delays import Delays, DelaysByNode, learn_delays
+from heliograph.learning.likelihood.trust_region import ClimbEnds
+from heliograph.learning.long_run_covariance import LEVEL, METHODS, Method
+from heliograph.learning.packet_losses.delay_law import Delays, DelaysByNode, learn_delays
+from heliograph.learning.parametric_network import Build, Description, describe
 from heliograph.learning.sender_fit import SenderFit, fit_sender, has_deciding_sender
 from heliograph.numerics.check import check_count, check_progress, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.module import readable
@@ -98,17 +98,17 @@ class Fit:
     @property
     def aic(self) -> float:
         """Akaike's information criterion, 2 k - 2 l; the smaller the better."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).aic
+        return compute_criteria(self.log_likelihood, self.free_numbers, self.observations).aic
 
     @property
     def aicc(self) -> float:
         """Akaike's criterion for few data: + 2 k (k + 1) / (n - k - 1)."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).aicc
+        return compute_criteria(self.log_likelihood, self.free_numbers, self.observations).aicc
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, k log n - 2 l."""
-        return information_criteria(self.log_likelihood, self.free_numbers, self.observations).bic
+        return compute_criteria(self.log_likelihood, self.free_numbers, self.observations).bic
 
     def likelihood_ratio(self, smaller: "Fit") -> FitTest:
         """Test a model with some of the free numbers fixed, fitted to the same data: 2 (l - l_0) is chi-square.
@@ -212,9 +212,9 @@ class Fit:
     def sentences(self) -> tuple[str, ...]:
         """Sentences on starts, boundaries, forms that disagree, and what the data cannot identify."""
         return (
-            *describe_climb(self.solutions, self.ends, self.stopped),
+            *describe_unfinished_climbs(self.solutions, self.ends, self.stopped),
             *describe_boundaries(self.best),
-            *describe_forms(self.solutions),
+            *describe_form_conflict(self.solutions),
             *self.identified.sentences,
         )
 
@@ -223,7 +223,7 @@ class Fit:
         delay_lines = [f"{node}: {found}" for node, found in self.delays.items()]
         if not self.best.has_rows:
             sentences = (
-                *describe_climb(self.solutions, self.ends, self.stopped),
+                *describe_unfinished_climbs(self.solutions, self.ends, self.stopped),
                 *self.identified.sentences,
             )  # those that need no interval
             return "\n".join([*self.best.describe_with_cheap_errors(), *delay_lines, *sentences, CHEAP_ERRORS])
@@ -319,7 +319,7 @@ def _maximise_forms(
     """
     ends, solutions = np.zeros(0), list[Solution]()
     for surface in surfaces:
-        search = MaximumSearch(surface, _report_climbs(surface, progress))
+        search = MaximumSearch(surface, _make_climb_reporter(surface, progress))
         try:
             top, stopped = search.run(points, seed), False
         except KeyboardInterrupt:
@@ -372,12 +372,12 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
     free, deviation = surface.domains.free, surface.standard_errors(start)
     far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
     drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free, far, SPREAD)
-    points = surface.move_to_possible(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
-    _check_dependence(surface, points)
+    points = surface.move_to_finite_likelihood(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
+    _require_information_on_each_number(surface, points)
     return points
 
 
-def _check_dependence(surface: LikelihoodSurface, points: np.ndarray) -> None:
+def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
     """Raise ValueError at a free number of which the data have no information at any of the points (points, p)."""
     largest = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
@@ -386,11 +386,11 @@ def _check_dependence(surface: LikelihoodSurface, points: np.ndarray) -> None:
         raise fail(f"free number {without[0]!r}", "one on which the measurements depend", "one on which nothing does")
 
 
-def _report_climbs(surface: LikelihoodSurface, say: Progress) -> Callable[[Maximum], None]:
+def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[[ClimbEnds], None]:
     """Return the function that reports, after each step of a search, how many climbs are done and how high they are."""
     form = surface.objective.form
 
-    def report(now: Maximum) -> None:
+    def report(now: ClimbEnds) -> None:
         best = np.nanmax(now.total)
         say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
 

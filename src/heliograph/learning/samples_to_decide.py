@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import scipy
 
-from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
-from heliograph.learning.intervals import estimate_long_run_deviation
+from heliograph.filters.gaussian.belief import open_loop_filter
 from heliograph.learning.likelihood.predictive_density import (
     NODES,
     ChannelDensities,
     evaluate_predictive,
     make_signal_filter,
 )
+from heliograph.learning.long_run_covariance import estimate_long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.module import are_same, readable
 from heliograph.numerics.types import ArrayLike

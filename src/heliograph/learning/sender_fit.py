@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.event.factory import event_filter
-from heliograph.learning.free_network import Description
-from heliograph.learning.intervals import LEVEL, find_allowed_fall
+from heliograph.learning.estimate_table import Row
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood_maximum import Row
-from heliograph.learning.losses.delays import DelaysByNode
+from heliograph.learning.long_run_covariance import LEVEL, find_profile_drop
+from heliograph.learning.packet_losses.delay_law import DelaysByNode
+from heliograph.learning.parametric_network import Description
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -146,7 +146,7 @@ def fit_sender(
     # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
-    top = _search_starts(likelihood, points)
+    top = _search_from_starts(likelihood, points)
     # An interval for each number, as far as Ctrl-C lets the search come.
     rows, stopped = list[Row](), top.stopped
     for i in range(len(parameters.entries)):
@@ -159,7 +159,7 @@ def fit_sender(
     return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
 
 
-def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]) -> "_Top":
+def _search_from_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]) -> "_BestPoint":
     """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
 
     Args:
@@ -169,17 +169,17 @@ def _search_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " 
     Raises:
         KeyboardInterrupt: before there was a first point.
     """
-    best: _Top | None = None  # of all evaluations
+    best: _BestPoint | None = None  # of all evaluations
 
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood at a point, and keep the best point so far."""
         nonlocal best
         total = likelihood(x)
         if best is None or total > best.total:
-            best = _Top(x.copy(), total, converged=False, stopped=True)
+            best = _BestPoint(x.copy(), total, converged=False, stopped=True)
         return total
 
-    ends = list[_Top]()  # of the searches
+    ends = list[_BestPoint]()  # of the searches
     try:
         for point in points:
             ends.append(_climb_simplex(evaluate, np.asarray(point)))
@@ -204,7 +204,7 @@ def _climb_simplex(
     enough: float = np.inf,
     size: float = LARGEST_SIMPLEX,
     digits: float = DIGITS,
-) -> "_Top":
+) -> "_BestPoint":
     """Return the best point of a search by Nelder and Mead from `start`.
 
     Args:
@@ -216,7 +216,7 @@ def _climb_simplex(
     """
     at_start = likelihood(start)
     if not len(start) or at_start > enough:  # nothing to search, or nothing to improve
-        return _Top(start, at_start, converged=True, stopped=False)
+        return _BestPoint(start, at_start, converged=True, stopped=False)
     simplex = start + size * np.concatenate([np.zeros((1, len(start))), np.eye(len(start))])
     most = MOST_EVALUATIONS * len(start)
     options: Any = {"initial_simplex": simplex, "xatol": digits, "fatol": 10 * digits, "maxfev": most}
@@ -230,7 +230,7 @@ def _climb_simplex(
         return -at_start if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
 
     optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop_above_enough)
-    return _Top(np.asarray(optimum.x), -float(optimum.fun), converged=bool(optimum.success), stopped=False)
+    return _BestPoint(np.asarray(optimum.x), -float(optimum.fun), converged=bool(optimum.success), stopped=False)
 
 
 def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
@@ -247,7 +247,7 @@ def _make_row_without_interval(description: Description, x: Float[np.ndarray, " 
     )
 
 
-def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_Top", index: int) -> Row:
+def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_BestPoint", index: int) -> Row:
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
     Args:
@@ -259,18 +259,18 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     """
     entry = description.parameters.entries[index]
     coordinate = index if entry.coordinate is None else entry.coordinate
-    profile = _Profile(likelihood, coordinate, top.total - find_allowed_fall(LEVEL))
+    profile = _Profile(likelihood, coordinate, top.total - find_profile_drop(LEVEL))
     ends = []
     for side in (-1.0, 1.0):
         # The entry of the table where its coordinate is at the end.
         point = top.x.copy()
-        point[coordinate] += side * profile.find_reach(top.x, side)
+        point[coordinate] += side * profile.find_distance_to_level(top.x, side)
         ends.append(float(description.parameters.entries_at(point)[index]))
     low, high = sorted(ends)
     return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL))
 
 
-class _Top(NamedTuple):
+class _BestPoint(NamedTuple):
     """Best point of a search: x on the line (p,), its log-likelihood, and how the search ended."""
 
     x: Float[np.ndarray, " p"]
@@ -296,7 +296,7 @@ class _Profile(NamedTuple):
     coordinate: int
     level: float
 
-    def find_reach(self, top: Float[np.ndarray, " p"], side: float) -> float:
+    def find_distance_to_level(self, top: Float[np.ndarray, " p"], side: float) -> float:
         """Return how far from the maximum `top` the profile falls to the level, to one side (-1.0 or 1.0).
 
         Twice as far each time until the profile is below it, then by bisection.

@@ -8,7 +8,7 @@ Moments: TypeAlias = tuple[float, float]  # of a node: time of its greatest coun
 ARRIVAL = ""  # the clock by which arrivals are dated, which is no node's
 
 
-class Leap(NamedTuple):
+class ClockLeap(NamedTuple):
     """A leap in time that one clock has made so far.
 
     Another clock confirms it: that of another node, the one on the wall, or that of an arrival where it agrees with the
@@ -37,11 +37,11 @@ class Leap(NamedTuple):
     clock: str = ARRIVAL
     believed: bool = False
     back: float | None = None
-    earlier: "Leap | None" = None
+    earlier: "ClockLeap | None" = None
 
-    def list_with_earlier(self) -> Iterator["Leap"]:
+    def list_with_earlier(self) -> Iterator["ClockLeap"]:
         """Yield this leap, then those before it that are believed, the newest first."""
-        leap: Leap | None = self
+        leap: ClockLeap | None = self
         while leap is not None:
             yield leap
             leap = leap.earlier
@@ -50,7 +50,7 @@ class Leap(NamedTuple):
         """Return whether the plant has gone on after it for as long as it leapt."""
         return now - self.since >= self.since - self.now
 
-    def as_believed(self) -> "Leap":
+    def as_believed(self) -> "ClockLeap":
         """Return this leap, believed; one that follows an earlier believed one is joined with that into one leap.
 
         Not with the leap with which the plant begins (`now` is -inf), which has no time before it.
@@ -59,7 +59,7 @@ class Leap(NamedTuple):
             return self._replace(believed=True, back=None)
         return self.earlier._replace(since=self.since, back=None)
 
-    def with_back(self, of: "Leap", back: float | None) -> "Leap":
+    def with_back(self, of: "ClockLeap", back: float | None) -> "ClockLeap":
         """Return this leap with its `back` set in that leap of its chain which is `of`."""
         if self is of:
             return self._replace(back=back)
@@ -80,7 +80,9 @@ class Leap(NamedTuple):
         return self.back is not None and self.back < time < self.back + self.time - time
 
 
-def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[Leap, float] | None:
+def find_contradicted_leap(
+    leap: ClockLeap | None, now: float, time: float, most: float
+) -> tuple[ClockLeap, float] | None:
     """Return the leap that `time` contradicts by lying before it, and the newest arrival after it; None if none.
 
     A time contradicts a leap if it is later than all before the leap, but more than `most` before its far side.
@@ -98,6 +100,6 @@ def find_leap(leap: Leap | None, now: float, time: float, most: float) -> tuple[
     return None
 
 
-def make_first_leap(time: float, clock: str) -> Leap:
+def make_first_leap(time: float, clock: str) -> ClockLeap:
     """Return the leap with which a plant begins: from no time at all to its first, by this clock."""
-    return Leap(time, time, -inf, {}, clock)
+    return ClockLeap(time, time, -inf, {}, clock)

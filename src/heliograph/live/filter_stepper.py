@@ -17,7 +17,7 @@ from heliograph.engine.choice import make_native_or_none, read_forced_engine
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.stored.old_layout import split_by_path
-from heliograph.live.stored.snapshot import Identity, versions
+from heliograph.live.stored.snapshot import Identity, list_versions
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import JudgedEstimate
 from heliograph.model.over_time import first
@@ -308,7 +308,7 @@ class CompiledFilter:
             )
         filter = self.filter
         return {
-            **versions(),
+            **list_versions(),
             "precision": ", ".join(sorted({str(leaf.dtype) for leaf in self.numbers})),
             "filter": type(filter).__name__,
             "states": ", ".join(filter.states),

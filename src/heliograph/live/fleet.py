@@ -7,16 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.live.clock_leap import ARRIVAL, Leap, find_leap
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
 from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
 from heliograph.live.link_counts import ScreenedEvent
-from heliograph.live.network_program import NetworkProgram
-from heliograph.live.plant import FinalisedPlant, PlantState
-from heliograph.live.plant_table import SlotTable, cut_into_legs, group_by_turn
-from heliograph.live.repeat_watch import RepeatWatch
+from heliograph.live.network_step_program import NetworkProgram
+from heliograph.live.plant_state import FinalisedPlant, PlantState
+from heliograph.live.plant_table import SlotTable, cut_chain_into_legs, group_by_turn
 from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
-from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, lay_side_by_side
-from heliograph.model.checks.refusal_reasons import count_by_reason
+from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, list_columns_of_blocks
+from heliograph.live.stuck_sensor_watch import RepeatWatch
+from heliograph.model.checks.refusals import count_by_reason
+from heliograph.model.limits import Limits
 from heliograph.model.over_time import steps_covered
 from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.repeated_readings import Repeats
@@ -71,7 +72,7 @@ class Fleet:
         self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self.sizes[INPUTS] = -1, self.program.given
         # Columns of these numbers in a row, by that index; how many numbers a row has before its time.
-        self._columns = lay_side_by_side([size for _, size in self.sizes.values()])
+        self._columns = list_columns_of_blocks([size for _, size in self.sizes.values()])
         self.width = self._columns[-1].stop
         covered = steps_covered(network)
         self.end_step = np.inf if covered is None else covered - 1  # the last step for which the network is defined
@@ -244,7 +245,7 @@ class Fleet:
         """Return the verdict on an event of a plant, and hold the event in its row if that is "used".
 
         An event more than `leap` after all before it is used, but nothing becomes final by it until another clock says
-        the same; if the next goes on from before it, it is withdrawn (`Leap` says it in full).
+        the same; if the next goes on from before it, it is withdrawn (`ClockLeap` says it in full).
 
         Args:
             plant: the plant.
@@ -281,14 +282,14 @@ class Fleet:
         """Advance the time of a plant to `now` by a clock that is right; a leap that contradicts it is withdrawn."""
         leap, longest_gap = plant.leap, self.options.leap
         if leap is not None:
-            found = find_leap(leap, plant.now, now, longest_gap)
+            found = find_contradicted_leap(leap, plant.now, now, longest_gap)
             if found is not None and found[0].now > -inf:  # not the leap with which the plant began
                 plant.undo_leap(found[0], longest_gap, self._names)
             elif now >= leap.time - longest_gap:  # the right clock has come as far: it confirms the leap
                 plant.leap = None
         plant.now = max(plant.now, now)
 
-    def undo_events(self, plant: PlantState, clock: tuple[float, Leap | None]) -> None:
+    def undo_events(self, plant: PlantState, clock: tuple[float, ClockLeap | None]) -> None:
         """Restore a plant to its state before the events taken since it was last finalised; `clock`: its own then."""
         self.pool.free_slots(plant.undo_changes())
         plant.clock = clock
@@ -319,7 +320,7 @@ class Fleet:
     def _step_chains(self, chains: Sequence[list[HeldRow]]) -> None:
         """Step from the first row of each chain into the second, and so on; their numbers stand in the table."""
         by_steps, endless = self.program.dt is None, self.end_step == np.inf
-        walks = [cut_into_legs(chain, by_steps, endless) for chain in chains]
+        walks = [cut_chain_into_legs(chain, by_steps, endless) for chain in chains]
         # All chains up to their first long gap at once, over these one by one, and so on.
         while walks:
             for steps in group_by_turn(legs[0].steps for legs in walks):

@@ -10,7 +10,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.event import CheckedEvent
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import PlantState
+from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.model.checks.non_finite_results import describe_non_finite_function
 from heliograph.model.estimate import Estimate
@@ -23,7 +23,7 @@ TRIES = 10  # to find the function of a filter that returned no number
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
-class Candidate(NamedTuple):
+class CandidateEvent(NamedTuple):
     """An event that was used and is to be judged: its message's number, its plant, itself, and the row it stands in."""
 
     number: int
@@ -70,7 +70,7 @@ class JudgementReader:
         """Return why the inputs that led to these outputs of a row are implausible; None if they are not."""
         return Judgement.why_inputs(outputs[self._all_columns])
 
-    def find_implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
+    def find_implausible(self, taken: Sequence[CandidateEvent]) -> dict[int, str]:
         """Return {index of an implausible candidate: the reason}, by the rows that were just stepped.
 
         Of a plant with implausible inputs only the first of these is returned: what comes after it was judged with it.
@@ -87,7 +87,9 @@ class JudgementReader:
         largest: dict[tuple[int, int], int] = {}
         for i in reasons:
             node_of_row = taken[i].row.slot, taken[i].event.node_index
-            largest[node_of_row] = max(largest.get(node_of_row, i), i, key=lambda j: _largest_number(taken[j].event))
+            largest[node_of_row] = max(
+                largest.get(node_of_row, i), i, key=lambda j: _find_largest_number(taken[j].event)
+            )
         # By plant, the index of its first implausible inputs. What came after them was judged with them: it may be all
         # right without them.
         first_inputs: dict[str, int] = {}
@@ -99,24 +101,24 @@ class JudgementReader:
         to_refuse = [i for i in reasons if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i]
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
-    def _find_flagged(self, taken: Sequence[Candidate]) -> list[int]:
+    def _find_flagged(self, taken: Sequence[CandidateEvent]) -> list[int]:
         """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none."""
         pool, slots = self.fleet.pool, np.array([candidate.row.slot for candidate in taken])
         flags = pool.outputs.start + self._all_columns[:, FLAGS].ravel()
         flagged: list[int] = np.flatnonzero((pool.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
         return flagged
 
-    def _explain_event(self, candidate: Candidate) -> str | None:
+    def _explain_event(self, candidate: CandidateEvent) -> str | None:
         """Return why a candidate is implausible by the judgements of its row; None if it is not, or has no number."""
         event, pool = candidate.event, self.fleet.pool
         outputs = pool.table[candidate.row.slot, pool.outputs]
         if event.is_inputs:
             return self.explain_inputs(outputs)
-        if _largest_number(event) < 0:
+        if _find_largest_number(event) < 0:
             return None
         return Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
 
-    def _name_faulty_function(self, candidate: Candidate) -> str:
+    def _name_faulty_function(self, candidate: CandidateEvent) -> str:
         """Return the name of a filter's function that returned no number in a row, after "; "; "" where none did.
 
         A filter's fault, once found, is repeated without another search. A filter is searched at most TRIES times, for
@@ -127,7 +129,7 @@ class JudgementReader:
         # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
         concerned = None if event.is_inputs else (Network.FUSED, self.fleet.network.names[event.node_index])
         for columns in self.fleet.program.filter_columns:
-            filter = filter_of(self.fleet, columns)
+            filter = find_filter_of_columns(self.fleet, columns)
             if filter is None or (concerned is not None and columns.node not in concerned):
                 continue
             # Only those that judged the row to be no number.
@@ -144,7 +146,7 @@ class JudgementReader:
                 return f"; {sentence}"
         return ""
 
-    def _find_row_before(self, candidate: Candidate) -> HeldRow:
+    def _find_row_before(self, candidate: CandidateEvent) -> HeldRow:
         """Return the row before the candidate's; there is one, since the first that is held takes no event."""
         rows = candidate.plant.rows
         return rows.held[rows.find_index(candidate.row.key) - 1]
@@ -157,7 +159,7 @@ class JudgementReader:
         covariance = outputs[columns.covariance : columns.covariance + n * n].reshape(n, n)
         return Estimate(outputs[columns.mean : columns.mean + n], covariance, columns.claim)
 
-    def _drop_blameless(self, taken: Sequence[Candidate], reasons: dict[int, str]) -> None:
+    def _drop_blameless(self, taken: Sequence[CandidateEvent], reasons: dict[int, str]) -> None:
         """Leave in `reasons`, of several nodes' events that a central filter judged together, only the one to blame.
 
         That is the first, from the largest on, without which the row is plausible; the largest if there is none.
@@ -170,13 +172,15 @@ class JudgementReader:
         for together in by_row.values():
             if len({taken[i].event.node_index for i in together}) > 1:
                 culprit = Judgement.find_culprit(
-                    together, lambda i: _largest_number(taken[i].event), lambda i: self._is_plausible_without(taken[i])
+                    together,
+                    lambda i: _find_largest_number(taken[i].event),
+                    lambda i: self._is_plausible_without(taken[i]),
                 )
                 for i in together:
                     if i != culprit:
                         del reasons[i]
 
-    def _is_plausible_without(self, candidate: Candidate) -> bool:
+    def _is_plausible_without(self, candidate: CandidateEvent) -> bool:
         """Return whether the candidate's row is plausible without all that it has of the candidate's node."""
         # A copy of the row in a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
@@ -192,7 +196,7 @@ class JudgementReader:
         return Judgement.why_values(judged) is None
 
 
-def _largest_number(event: CheckedEvent) -> float:
+def _find_largest_number(event: CheckedEvent) -> float:
     """Return the largest absolute number of an event, -1 if it has none."""
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
@@ -217,7 +221,7 @@ class WatchedAngles(NamedTuple):
     angles: WideAngles
 
 
-class FleetAngles:
+class AngleWatch:
     """Watch a fleet for angles that a filter knows less well than it can use, and for degrees; each is said once."""
 
     def __init__(self, fleet: Fleet):
@@ -250,7 +254,7 @@ def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
     """Return for each filter with angles among its states what to watch: the variances of its states."""
     watched = list[WatchedAngles]()
     for columns in fleet.program.filter_columns:
-        filter = filter_of(fleet, columns)
+        filter = find_filter_of_columns(fleet, columns)
         if filter is not None and (angles := WideAngles(filter)).states:
             # The diagonal of its covariance, (n, n) row by row.
             n = len(filter.states)
@@ -266,7 +270,7 @@ def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
     """
     watched, seen = list[WatchedAngles](), set[int]()
     for columns in fleet.program.filter_columns:
-        filter = filter_of(fleet, columns)
+        filter = find_filter_of_columns(fleet, columns)
         if filter is None or not filter.received:
             continue
         names = _list_received(fleet.network, columns.node)
@@ -290,7 +294,7 @@ def _list_received(network: Network, node: str) -> dict[int, str]:
     }
 
 
-def filter_of(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
+def find_filter_of_columns(fleet: Fleet, output: FilterColumns) -> AbstractFilter | None:
     """Return the filter of these columns; None of a fusion rule."""
     if output.node == Network.FUSED:
         central = fleet.network.fused[output.filter]

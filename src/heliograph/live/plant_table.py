@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from heliograph.live.long_gap import LONG, TAIL, find_factor_places, pass_long_gap
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.numerics.types import Float, PyTree
 
@@ -155,14 +155,14 @@ def _insert_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[n
 Single: TypeAlias = tuple[int, int, float]  # a step: slot to step from, slot to step into, number
 
 
-class Leg(NamedTuple):
+class ChainLeg(NamedTuple):
     """Steps of a chain one by one, and the step number to which the last row is then taken at once; 0 if to none."""
 
     steps: list[Single]
     jump: int = 0
 
 
-def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[Leg]:
+def cut_chain_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[ChainLeg]:
     """Return the steps along a chain of rows, cut into legs where a gap is too long to step through one by one.
 
     Args:
@@ -170,14 +170,14 @@ def cut_into_legs(chain: list[HeldRow], by_steps: bool, endless: bool) -> list[L
         by_steps: whether time counts steps.
         endless: whether the network is defined for all steps, so that silent steps are alike.
     """
-    legs = [Leg([])]
+    legs = [ChainLeg([])]
     for row, next_row in pairwise(chain):
         begin, last, before = int(row.key[0]) + 1, next_row.key[0], row.slot
         numbers: Sequence[float] = range(begin, int(last) + 1) if by_steps else (last,)
         if len(numbers) > LONG and endless:
             # One step into the new row, which is then taken in place to TAIL steps before its own; these one by one.
-            legs[-1] = Leg([*legs[-1].steps, (before, next_row.slot, begin)], jump=int(last) - TAIL)
-            legs.append(Leg([]))
+            legs[-1] = ChainLeg([*legs[-1].steps, (before, next_row.slot, begin)], jump=int(last) - TAIL)
+            legs.append(ChainLeg([]))
             before, numbers = next_row.slot, range(int(last) - TAIL + 1, int(last) + 1)
         for at in numbers:
             legs[-1].steps.append((before, next_row.slot, at))

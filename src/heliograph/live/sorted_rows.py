@@ -171,7 +171,7 @@ class SortedRows:
         return final, left
 
 
-def lay_side_by_side(sizes: Sequence[int]) -> list[slice]:
+def list_columns_of_blocks(sizes: Sequence[int]) -> list[slice]:
     """Return the columns of blocks of these sizes, one behind another from column 0."""
     ends = np.cumsum(sizes)
     return [slice(int(end) - size, int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -10,13 +10,13 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.live.filter_stepper import RARE, compile_once, find_deciding_sender
-from heliograph.live.repeat_watch import RepeatWatch
 from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
-from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
-from heliograph.model.checks.non_finite_results import describe_non_finite_function
-from heliograph.model.checks.plant_inputs import check_inputs
-from heliograph.model.checks.refusal_reasons import SCREENED, Reason, count_by_reason
+from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
+from heliograph.live.stuck_sensor_watch import RepeatWatch
+from heliograph.model.checks.faults import find_function_fault
+from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.reading_limits import LimitsLike, ScreenedReadings, make_limits
@@ -198,7 +198,7 @@ class Stream:
         self._repeats = watch.extend_runs(z.tolist(), self._repeats)
         for i, count in enumerate(self._repeats.found if self._repeats.found != found_before else ()):
             if count == 1 and not (found_before and found_before[i]):
-                said = watch.describe(i, f"received number {i}", self._repeats)
+                said = watch.describe_stuck_output(i, f"received number {i}", self._repeats)
                 warnings.warn(f"stream, step {self.steps - 1}: {said}", stacklevel=3)
 
     def _warn_of_remark(self) -> None:
@@ -280,7 +280,7 @@ class Stream:
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
             "of": self._compiled.identity,
         }
-        return pack(head, leaves)
+        return pack_snapshot(head, leaves)
 
     @classmethod
     def restore(

@@ -10,17 +10,17 @@ import numpy as np
 from heliograph.live.event import INPUTS, VERDICTS, CheckedEvent, Verdict, check_63_bits, check_moment, check_numbers
 from heliograph.live.final_rows import FinalRows, GateCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
-from heliograph.live.implausible_events import Candidate, FleetAngles, JudgementReader
+from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
+from heliograph.live.forecast_start_of_row import estimates_by_name, judged_estimates_by_name, make_forecast_origin
+from heliograph.live.implausible_events import AngleWatch, CandidateEvent, JudgementReader
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.network_program import shared_program
-from heliograph.live.row_origin import estimates_by_name, judged_estimates_by_name, make_forecast_origin
+from heliograph.live.network_step_program import shared_program
 from heliograph.live.sender_status import SenderStatus
 from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
-from heliograph.live.stored.snapshot import check_same_network, pack, unpack_snapshot
-from heliograph.model.checks.refusal_reasons import SCREENED, Reason
+from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
+from heliograph.model.checks.refusals import SCREENED, Reason
 from heliograph.model.estimate import Estimate
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value
@@ -97,7 +97,7 @@ class Timeline:
         # What judges events, and what is warned of: angles, states of filters, readings that repeat.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
-        self._angles, self._remarks = FleetAngles(self._fleet), FleetRemarks(self._fleet)
+        self._angles, self._remarks = AngleWatch(self._fleet), RemarkWatch(self._fleet)
         self._held = FleetRepeatWatch(self._fleet)
         # Of final rows: what filters left out, and the outputs that `final` has not returned yet.
         self._gates = GateCounts(self._program.filter_columns)
@@ -106,7 +106,7 @@ class Timeline:
     def __getstate__(self) -> dict[str, object]:
         """Return the whole state, in double precision; compiled programs are left out."""
         head, arrays = self._pack_state()
-        return {"network": self.network, "saved": pack(head, arrays)}
+        return {"network": self.network, "saved": pack_snapshot(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
         vars(self).update(vars(self._resume_from(stored["network"], *unpack_snapshot(stored["saved"]))))
@@ -164,7 +164,7 @@ class Timeline:
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once); return the verdict on it.
 
-        It costs a step from the event's row on into each later one.
+        It costs one step of all filters for the event's row and for each later one.
 
         Args:
             node: name of the node, or "inputs" of the plant's inputs.
@@ -180,10 +180,10 @@ class Timeline:
         plant, clock_before = self._plant, self._plant.clock
         screened = self._fleet.screen_event(node, self._convert_event(node, sequence, time, values, arrival), plant)
         event = screened.event
-        verdict = self._fleet.take_event(plant, event, arrival is not None)
+        verdict = self._fleet.take_event(plant, event, arrival_known=arrival is not None)
         if verdict == "used":
             row, _ = plant.changes[-1]  # that which holds the event now
-            why = screened.why if screened.is_empty else self._why_implausible(event, row)
+            why = screened.why if screened.is_empty else self._explain_implausible(event, row)
             if why is not None:
                 # As if it had never arrived.
                 verdict, self.reasons[node] = "implausible", why
@@ -198,14 +198,14 @@ class Timeline:
             warnings.warn(f"timeline, {line}", stacklevel=2)
         return verdict
 
-    def _why_implausible(self, event: CheckedEvent, row: HeldRow) -> str | None:
+    def _explain_implausible(self, event: CheckedEvent, row: HeldRow) -> str | None:
         """Step what an event changed; return why it is implausible, None if it is not.
 
         Inputs are also judged over one unit of time after them.
         """
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
-        why = self._judges.find_implausible([Candidate(0, plant, event, row)]).get(0)
+        why = self._judges.find_implausible([CandidateEvent(0, plant, event, row)]).get(0)
         if why is None and event.is_inputs and self._program.dt is not None:
             after = fleet.pool.predict_outputs(np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf)
             why = self._judges.explain_inputs(after[0])
@@ -283,7 +283,7 @@ class Timeline:
     def save(self) -> bytes:
         """Serialise the whole state for `restore`: after it, the same pushes give the same bits."""
         head, arrays = self._pack_state()
-        return pack(head | {"of": self._program.identity, DESCRIPTION: self._describe_network}, arrays)
+        return pack_snapshot(head | {"of": self._program.identity, DESCRIPTION: self._describe_network}, arrays)
 
     @cached_property
     def _describe_network(self) -> str:

@@ -1,13 +1,13 @@
 """Public names of the room; the package loads them when first used."""
 
-from .bits import (
+from .bit_allocation import (
     BitsDesign as BitsDesign,
     design_bits as design_bits,
 )
-from .budget import (
+from .power_budget import (
     Budget as Budget,
 )
-from .comparisons import (
+from .design_comparisons import (
     error_over_power as error_over_power,
     error_over_sites as error_over_sites,
     worth_of_changes as worth_of_changes,
@@ -23,20 +23,20 @@ from .message_rates import (
     send_on_delta_rate as send_on_delta_rate,
     simulate_rate as simulate_rate,
 )
-from .paths.networks import (
+from .multihop_paths.network_to_paths import (
     paths_of as paths_of,
 )
-from .paths.model import (
+from .multihop_paths.model import (
     independent_paths as independent_paths,
 )
-from .problem import (
+from .design_problem import (
     DesignProblem as DesignProblem,
     PowerDesign as PowerDesign,
 )
-from .network_of_design import (
+from .network_from_design import (
     designed_network as designed_network,
 )
-from .paths.relaxation import (
+from .multihop_paths.power_split_over_hops import (
     split_power as split_power,
 )
 from .sensor_worth import (

@@ -116,14 +116,14 @@ class Criterion(NamedTuple):
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
-    def exact(self, p: Matrices) -> float:
+    def compute_exact_error(self, p: Matrices) -> float:
         """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
         if self.sharpness is None:
             return self.smooth(p)[0]
         root = _find_root(self.weight)
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
-    def supporting(self, p: Matrices) -> "Criterion":
+    def make_tangent(self, p: Matrices) -> "Criterion":
         """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere."""
         if self.sharpness is None:
             return self
@@ -131,7 +131,7 @@ class Criterion(NamedTuple):
         size = np.trace(root @ weights @ root, axis1=1, axis2=2)
         return self._replace(weight=weights / size[:, None, None], sharpness=None)
 
-    def sharper(self) -> "list[Criterion]":
+    def list_from_smoothest(self) -> "list[Criterion]":
         """Return the criteria from the smoothest to this one, by which a search begins: only this one for a trace."""
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 

@@ -50,7 +50,7 @@ class MessageRate(NamedTuple):
     error_error: np.ndarray
 
 
-class _Cells(NamedTuple):
+class _CellGrid(NamedTuple):
     """Grid of cells: how many lie on either side of 0, how many reach from a cell to delta, and their length."""
 
     each_side: int
@@ -144,7 +144,7 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
         ValueError: a plant or sensor of more than one state and output; a loss of 1 or more.
     Source: Lipsa and Martins, Remote state estimation with communication costs for first-order LTI systems (2011).
     """
-    system = _check_scalar(plant, sensor)
+    system = _require_scalar_system(plant, sensor)
     a, q, c, r = system
     delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
     if not loss < 1:
@@ -164,8 +164,8 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     # The integral equation of v at the nodes (Nystrom's method), then the sums over a cycle.
     is_within = np.abs(nodes) <= delta
     kappa = np.where(is_within, 1.0, loss)
-    kernel = kappa[:, None] * _normal(nodes[:, None] - a * nodes, s * s) * weights  # [to, from]
-    visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal(nodes, s * s)) * weights  # v de
+    kernel = kappa[:, None] * _normal_density(nodes[:, None] - a * nodes, s * s) * weights  # [to, from]
+    visits = np.linalg.solve(np.eye(len(nodes)) - kernel, kappa * _normal_density(nodes, s * s)) * weights  # v de
     cycle = 1 + visits.sum()
     rate = (1 + visits[~is_within].sum()) / cycle
     error = posterior + nodes**2 @ visits / cycle
@@ -189,7 +189,7 @@ def least_error(plant: AnyPlant, sensor: AnySensor, rate: float, loss: float = 0
         ValueError: as `prediction_error_rate`; a rate that is not between 0 and 1.
     """
     delta = _find_threshold(
-        rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _check_scalar(plant, sensor)
+        rate, lambda d: prediction_error_rate(plant, sensor, d, loss).rate, _require_scalar_system(plant, sensor)
     )
     return float(prediction_error_rate(plant, sensor, delta, loss).error[0])
 
@@ -212,7 +212,7 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
             that less than one message in a million steps is sent; a grid that is too fine, or a rate that converges
             too slowly to be computed.
     """
-    rate = _send_on_delta_rate(_check_scalar(plant, sensor), float(scalar("delta", delta, TINY)))
+    rate = _send_on_delta_rate(_require_scalar_system(plant, sensor), float(scalar("delta", delta, TINY)))
     if rate < RAREST:
         raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
     return rate
@@ -231,7 +231,7 @@ def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
     return fine if fine == coarse else float(fine + (fine - coarse) * half**2 / (h**2 - half**2))
 
 
-def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _Cells:
+def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _CellGrid:
     """Return the grid of cells for a state and a value sent last.
 
     Cells are at most `share` of the deviation of either noise, in units of the state.
@@ -252,7 +252,7 @@ def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _Cells:
             f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
             f"{measured / min(np.sqrt(q), np.sqrt(r), delta):.3g} times",
         )
-    return _Cells(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
+    return _CellGrid(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
 
 
 def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> tuple[float, float]:
@@ -274,7 +274,7 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     def move_and_send(vector: np.ndarray) -> np.ndarray:
         """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
         f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + _send_part(f, noise, cells.of_delta)).ravel()
+        return np.asarray(f * quiet + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
@@ -287,10 +287,10 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_send_part(move @ f, noise, cells.of_delta).sum()), cells.length
+    return float(_compute_law_after_message(move @ f, noise, cells.of_delta).sum()), cells.length
 
 
-def _send_part(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
+def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:
     """Return the part of the law f that sends a message, after it: last sent is what is measured now.
 
     Args:
@@ -328,7 +328,7 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
     Raises:
         ValueError: as `send_on_delta_rate`; a rate that is not between 0 and 1.
     """
-    system = _check_scalar(plant, sensor)
+    system = _require_scalar_system(plant, sensor)
     return _find_threshold(rate, lambda delta: _send_on_delta_rate(system, delta), system, GRID_ACCURACY)
 
 
@@ -347,7 +347,7 @@ def _find_threshold(
     return float(brentq(lambda delta: rate_at(delta) - rate, low, high, rtol=accuracy, xtol=accuracy * unit))
 
 
-def _check_scalar(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
+def _require_scalar_system(plant: AnyPlant, sensor: AnySensor) -> _ScalarSystem:
     """Return a, q, c and r of a linear plant and sensor; ValueError unless they have one state and one output."""
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
@@ -375,6 +375,6 @@ def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.nd
     return nodes, np.concatenate([(b - a) / 2 * w for a, b in parts])
 
 
-def _normal(e: np.ndarray, variance: float) -> np.ndarray:
+def _normal_density(e: np.ndarray, variance: float) -> np.ndarray:
     """Return the density N(e; 0, variance)."""
     return np.asarray(np.exp(-(e**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance))

@@ -6,16 +6,16 @@ from heliograph.filters.linear.scheduled_gains import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar, show_value
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.added_signals import adds_up, design_sum_of_links
-from heliograph.planning.budget import check_budget, make_power_limits, make_unlimited
+from heliograph.planning.design_problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.error_objective import Error
-from heliograph.planning.network_of_design import BEST, COVERED
-from heliograph.planning.numbers.design import design_numbers
-from heliograph.planning.paths.design import design_paths, make_power_task
-from heliograph.planning.paths.model import Paths
-from heliograph.planning.paths.networks import paths_of
+from heliograph.planning.free_numbers.design import design_numbers
+from heliograph.planning.multihop_paths.design import design_paths, make_power_task
+from heliograph.planning.multihop_paths.model import Paths
+from heliograph.planning.multihop_paths.network_to_paths import paths_of
+from heliograph.planning.network_from_design import BEST, COVERED
 from heliograph.planning.plant_moments import measured_moment_with_one, steady_moment_with_one
-from heliograph.planning.problem import BudgetLike, Certificate, Designable, DesignProblem, Free, PowerDesign
+from heliograph.planning.power_budget import make_budget, make_power_limits, make_unlimited
+from heliograph.planning.sum_of_links_design import design_sum_of_links, is_sum_of_links
 from heliograph.planning.transmitters import find_free_transmitters
 from heliograph.relays.design import given_design, receiver_behind_relays, relay_schedules
 from heliograph.relays.periodic_steady_state import (
@@ -103,7 +103,7 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     if problem.budget is None and problem.target_error is None:
         raise fail("design", "a budget of power or a target error", "neither")
     network, error = problem.network, problem.criterion
-    if isinstance(network, Network) and adds_up(network):
+    if isinstance(network, Network) and is_sum_of_links(network):
         return design_sum_of_links(problem, network)
     # Paths, and the powers (time, hop) that are sent at present; paths from arrays have none yet.
     if isinstance(network, Network):
@@ -119,13 +119,13 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
     if problem.budget is None:
         limits = make_unlimited(error.steps, int(free.sum()))
     else:
-        limits = make_power_limits(check_budget(problem.budget), paths.names, free, present_powers)
+        limits = make_power_limits(make_budget(problem.budget), paths.names, free, present_powers)
     starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
     # A target error, or None: then the least error within the budget is sought.
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)
     sends_already = isinstance(network, Network)
-    present_error = task.problem.exact(present_powers[:, free]) if sends_already else float("nan")
+    present_error = task.problem.compute_exact_error(present_powers[:, free]) if sends_already else float("nan")
     return design_paths(problem, task, target, present_error)
 
 
@@ -151,7 +151,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     Raises:
         ValueError: another error than the steady trace, a target error, some relays free alone, limits of single ones.
     """
-    power_limit = _check_relay_problem(problem)
+    power_limit = _find_relay_power_limits(problem)
     # Error covariances (slots, n, n) with the designed gains, and with those that minimise each relay's own error.
     gains = periodic_relays_for_best_receiver(relays, power_limit=power_limit)
     local_gains = periodic_local_error_design(relays).gains
@@ -182,7 +182,7 @@ def design_relays(problem: DesignProblem, relays: RelayNetwork) -> PowerDesign:
     )
 
 
-def _check_relay_problem(problem: DesignProblem) -> float | None:
+def _find_relay_power_limits(problem: DesignProblem) -> float | None:
     """Return what all relays together may send in each slot, None without a limit.
 
     Raises:
@@ -193,7 +193,7 @@ def _check_relay_problem(problem: DesignProblem) -> float | None:
     error = problem.criterion
     if error.weight is not None or error.worst or error.steps > 1 or error.horizon is not None:
         raise fail("error of relays that filter", "the steady trace (slots are the steps)", "another")
-    limits = None if problem.budget is None else check_budget(problem.budget)
+    limits = None if problem.budget is None else make_budget(problem.budget)
     if limits is not None and (limits.total is None or limits.per_transmitter is not None or limits.peak is not None):
         raise fail("budget of relays that filter", "a total for each slot", "other limits")
     return None if limits is None else limits.total

@@ -56,7 +56,7 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
     return np.asarray((total + total.T) / 2)
 
 
-def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
+def require_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
     """Return plant and noise of the first step; ValueError unless it is linear and its noise depends on no inputs."""
     start = first(plant)
     if not isinstance(start, LinearPlant):
@@ -66,12 +66,12 @@ def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
     return start, start.noise
 
 
-def check_design_plant(plant: AnyPlant) -> LinearPlant:
+def require_design_plant(plant: AnyPlant) -> LinearPlant:
     """Return the plant of the first step; ValueError unless it is one of which powers can be designed.
 
     That is a linear one with constant noise, without inputs and angles.
     """
-    start, _ = check_constant_noise(plant)
+    start, _ = require_constant_noise(plant)
     if start.inputs:
         raise fail("plant of a design", "no inputs", list(start.inputs))
     refuse_angles("design", start)
@@ -84,7 +84,7 @@ def steady_moment_with_one(plant: AnyPlant) -> Float[Array, "n1 n1"]:
     Raises:
         ValueError: a plant that varies or is not stable.
     """
-    start, noise = check_constant_noise(plant)
+    start, noise = require_constant_noise(plant)
     if isinstance(plant, OverTime):
         raise fail("steady power", "a plant that does not vary (give a horizon)", "one that is an OverTime")
     spread = steady_covariance(start.matrix, noise.covariance)
@@ -114,15 +114,15 @@ def moments_with_one_over(
     maps, added = [], []
     for k in range(horizon):
         now = at(plant, k)
-        noise_mean, noise = _read_noise(now, u[k])
-        maps.append(_extend(now.matrix, now.input_matrix @ u[k] + noise_mean))
+        noise_mean, noise = _compute_noise_moments(now, u[k])
+        maps.append(_append_shift(now.matrix, now.input_matrix @ u[k] + noise_mean))
         added.append(library(noise).pad(noise, ((0, 1), (0, 1))))
     xp = library(maps, added)
     system = JumpSystem(np.ones((horizon, 1, 1)), xp.stack(maps)[:, None], xp.stack(added)[:, None])
     return [one for (one,) in system.after(_make_second_moment(start.initial_mean, start.initial_covariance)[None])]
 
 
-def _read_noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
+def _compute_noise_moments(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
     """Return the mean and covariance of the plant's noise w at inputs u; JAX may trace a noise that depends on them."""
     if isinstance(plant.noise, AbstractNoise):
         return plant.noise.mean, plant.noise.covariance
@@ -134,12 +134,12 @@ def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], s
     """Return the second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
     now = at(sensor, step)
     c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
-    rows = _extend(c, offset)
+    rows = _append_shift(c, offset)
     sensed: Array = rows @ second @ rows.T + library(noise).pad(noise, ((0, 1), (0, 1)))
     return sensed
 
 
-def _extend(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
+def _append_shift(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
     """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1)."""
     last = np.eye(1, matrix.shape[1] + 1, matrix.shape[1])
     xp = library(matrix, shift)

@@ -119,7 +119,7 @@ def worth_of_sensors(
             with triggers or words, relays that filter.
     """
     instance("network", network, Network, "a Network")
-    nodes, added = _check_plain_nodes(network), table("additions", additions or {}, "nodes")
+    nodes, added = _require_plain_nodes(network), table("additions", additions or {}, "nodes")
     if taken := [name for name in added if name in nodes]:
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
@@ -138,12 +138,12 @@ def worth_of_sensors(
     for case in cases:
         z_of_case = np.where(np.repeat(case.used, sizes, axis=1), z, np.nan)
         squares = _compute_squares_at_end(filter_of_all, z_of_case, u, truth, is_exact)
-        errors.append(_describe_error(case.name, squares, complete=errors[0].error if errors else None))
+        errors.append(_make_error_of_case(case.name, squares, complete=errors[0].error if errors else None))
     complete, *others = errors
     return SensorWorth(network.states, complete=complete, cases=tuple(others), exact=is_exact, added=tuple(added))
 
 
-def _describe_error(
+def _make_error_of_case(
     name: str, squares: Float[np.ndarray, "runs n"], complete: Float[np.ndarray, " n"] | None
 ) -> ErrorWithout:
     """Return the root mean square error of a case, with its standard error and its ratio to that of all nodes.
@@ -162,7 +162,7 @@ def _describe_error(
     return ErrorWithout(name=name, error=error, uncertainty=uncertainty, increase=increase)
 
 
-def _check_plain_nodes(network: Network) -> dict[str, Node]:
+def _require_plain_nodes(network: Network) -> dict[str, Node]:
     """Return the nodes; ValueError where more than a sensor and a link makes what they receive.
 
     Refused are relays that filter, nodes that share a channel, triggers and encoders.

@@ -30,7 +30,7 @@ from .storage.store_protocol import (
 from .storage.store import (
     Store as Store,
 )
-from .assembly import (
+from .service_assembly import (
     make_transport as make_transport,
 )
 from .brokers.transport import (
@@ -41,7 +41,7 @@ from .brokers.transport import (
     part_of as part_of,
     encode_name as encode_name,
 )
-from .brokers.translator import (
+from .brokers.source_translator import (
     Translator as Translator,
 )
 from .brokers.line_reader import (
@@ -54,15 +54,15 @@ from .brokers.state_topics import (
     StatePublishing as StatePublishing,
     StateTopics as StateTopics,
 )
-from .brokers.url import (
+from .brokers.broker_address import (
     Address as Address,
     parse_address as parse_address,
 )
-from .loop import (
+from .service_loop import (
     keep_running as keep_running,
     serve_until as serve_until,
 )
-from .brokers.contract import (
+from .brokers.transport_contract import (
     Broker as Broker,
     check_transport as check_transport,
 )

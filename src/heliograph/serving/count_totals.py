@@ -41,7 +41,7 @@ class LinkTotals(Protocol):
     implausible: int
 
 
-def counts_of(link: LinkTotals) -> dict[str, int]:
+def list_counts_of_link(link: LinkTotals) -> dict[str, int]:
     """Return the counts of a node by FIELDS."""
     refused = {str(reason): count for reason, count in link.refused.items()}
     return {name: refused.get(name, 0) if name in OF_NODES else getattr(link, name) for name in FIELDS}
@@ -61,7 +61,7 @@ class CountTotals:
     def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
         """Add what has changed in a plant's counts since they were added last."""
         for node, link in links.items():
-            now = tuple(counts_of(link).values())
+            now = tuple(list_counts_of_link(link).values())
             before = self._seen.get((plant, node), (0,) * len(FIELDS))
             if now != before:
                 self._seen[plant, node] = now

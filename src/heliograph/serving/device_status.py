@@ -1,15 +1,15 @@
-"""Last words of devices, online or offline, kept in the store with the state of the plants."""
+"""Status of devices, online or offline, by their last words, kept in the store with the state of the plants."""
 
 from collections.abc import Sequence
 
-from heliograph.files.device_availability import DeviceStatuses
-from heliograph.serving.loop import BatchService
+from heliograph.files.availability import DeviceStatuses
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.serving.service_loop import BatchService
 from heliograph.serving.storage.store_protocol import StoreProtocol
 
 
-class LastWordsService:
+class DeviceStatusService:
     """A service that keeps the last words of devices: a device that was offline is so after a restart.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import Judgement
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.output_columns import FilterColumns
 

@@ -118,7 +118,7 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
             if not quick or rb"\u0000" in payload or len(payload) > LONGEST:
                 raise msgspec.DecodeError
             read = _FAST.decode(payload)
-            _refuse_doubled(payload, read)
+            _refuse_doubled_fields(payload, read)
             results.append(read)
         except (msgspec.DecodeError, UnicodeDecodeError, InputError):
             results.append(_read_or_explain(payload))
@@ -156,7 +156,7 @@ def read_message(payload: bytes) -> Message:
         raise fail("message", f"at most {LONGEST} bytes", len(payload))
     try:
         read = _READER.validate_json(payload)
-        _refuse_doubled(payload, read)
+        _refuse_doubled_fields(payload, read)
         return read
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
@@ -168,7 +168,7 @@ def read_message(payload: bytes) -> Message:
         raise fail(f"message, {field}", EXPECTED[field], came) from None
 
 
-def _refuse_doubled(payload: bytes, read: AnyMessage) -> None:
+def _refuse_doubled_fields(payload: bytes, read: AnyMessage) -> None:
     """Raise ValueError where a line has a field twice, of which decoders use the last.
 
     Each field's name and each text has two quotes: a line that has just the quotes of what was read has no field twice.

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from heliograph.live.fleet import Fleet
-from heliograph.live.plant import PlantState
+from heliograph.live.plant_state import PlantState
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.serving.output import Output
 from heliograph.simulation.centres.node_filter import NodeFilter

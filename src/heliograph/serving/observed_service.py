@@ -6,9 +6,9 @@ from threading import Lock
 from typing import Protocol
 
 from heliograph.serving.count_totals import LinkTotals
-from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.serving.service_loop import BatchService
 
 
 class WatchedPlant(Protocol):

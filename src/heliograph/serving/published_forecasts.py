@@ -8,11 +8,11 @@ import numpy as np
 
 import heliograph
 from heliograph.live.fleet import Fleet
-from heliograph.live.row_origin import make_forecast_origin
+from heliograph.live.forecast_start_of_row import make_forecast_origin
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import fail, show_value
-from heliograph.serving.thresholds import Thresholds, check_threshold_names, find_crossings
+from heliograph.serving.thresholds import Thresholds, check_threshold_names, find_crossing_probabilities
 
 # Forecasts at one horizon: its time, how far ahead it is, and what each filter says, by node and filter.
 Ahead = tuple[float, float, dict[str, dict[str, object]]]
@@ -149,7 +149,7 @@ class ForecastPublisher:
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
         passed = tuple(threshold for threshold in self._thresholds if threshold.name in known)
-        return find_crossings(start, place, passed, self.horizons, not self._continuous) if passed else {}
+        return find_crossing_probabilities(start, place, passed, self.horizons, not self._continuous) if passed else {}
 
 
 def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:

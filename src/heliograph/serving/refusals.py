@@ -16,17 +16,17 @@ WHY: dict[Verdict, str] = {
 }
 
 
-def refuse_message(message: Read, why: str, detail: str) -> Entry:
+def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
     """Return the refusal of a message, with what names it as far as it was read."""
     if isinstance(message, str):
-        return write_refusal(None, {}, why, detail)
+        return make_refusal_entry(None, {}, why, detail)
     read = message.read if isinstance(message, UnreadMessage) else message
     moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time
     parts = {"node": read.node, "sequence": read.sequence, "time": moment}
-    return write_refusal(read.plant, parts, why, detail)
+    return make_refusal_entry(read.plant, parts, why, detail)
 
 
-def write_refusal(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
+def make_refusal_entry(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
     """Return the refusal of a message as an entry for the store; `parts`: node, sequence and time, if known."""
     results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
     return Entry(plant or "", "refused", encode_line(results | parts | {"reason": why, "detail": detail}))

@@ -12,22 +12,22 @@ from typing import NamedTuple
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Fleet as Fleet
 from heliograph.live.fleet import Options as Options
-from heliograph.live.fleet_remarks import FleetRemarks, FleetRepeatWatch
-from heliograph.live.implausible_events import FleetAngles
-from heliograph.live.network_program import NetworkProgram as NetworkProgram
-from heliograph.live.plant import FinalisedPlant, PlantState, WithdrawnEvent
+from heliograph.live.fleet_warnings import FleetRepeatWatch, RemarkWatch
+from heliograph.live.implausible_events import AngleWatch
+from heliograph.live.network_step_program import NetworkProgram as NetworkProgram
+from heliograph.live.plant_state import FinalisedPlant, PlantState, WithdrawnEvent
 from heliograph.live.sorted_rows import HeldRow
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.numerics.check import instance, show_value
 from heliograph.numerics.process.garbage_collector import pause_collector
+from heliograph.serving.batch_intake import BatchIntake, MessageOutcome, find_plant_name
 from heliograph.serving.estimate_writer import EstimateWriter, encode_line
-from heliograph.serving.intake import BatchIntake, Outcome, plant_of
 from heliograph.serving.message import AnyMessage, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.serving.neighbour_exchange import NeighbourMessenger
 from heliograph.serving.output import Output
 from heliograph.serving.published_forecasts import ForecastPublisher, Spans
-from heliograph.serving.refusals import WHY, refuse_message, write_refusal
-from heliograph.serving.silence import SilenceWatch, find_dead_senders
+from heliograph.serving.refusals import WHY, make_refusal_entry, make_refusal_of_message
+from heliograph.serving.silent_senders import SilenceWatch, find_dead_senders
 from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.thresholds import Thresholds
 
@@ -87,7 +87,7 @@ class Service:
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
         # What is said of plants: doubts by `_doubt`, the first implausible message by `_say`, which then becomes None.
-        self._angles, self._remarks, self._held = FleetAngles(fleet), FleetRemarks(fleet), FleetRepeatWatch(fleet)
+        self._angles, self._remarks, self._held = AngleWatch(fleet), RemarkWatch(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
         self._published: int | None = None  # number of the newest output published since the last commit
@@ -125,7 +125,7 @@ class Service:
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
         """Tell the estimates by now of plants of which a sender has timed out; nothing is committed."""
-        late = self._silence.find_overdue(self.plants.values(), now)
+        late = self._silence.find_plants_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
@@ -138,7 +138,7 @@ class Service:
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
         # Rows that are final by the clock, and events whose clocks it shows to be wrong.
-        due = self._silence.find_due(self.plants.values(), now)  # plants, each with the step that it is by now
+        due = self._silence.find_plants_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
         finalised = self.fleet.finalise_plants(plant for plant, _ in due)
@@ -163,14 +163,14 @@ class Service:
             Message.model_construct(
                 plant=plant.name, node=INPUTS, sequence=int(step), time=now, values=unchanged, inputs=None, arrival=None
             )
-            for plant, step in self._silence.find_due(self.plants.values(), now)
+            for plant, step in self._silence.find_plants_due(self.plants.values(), now)
         ]
 
     def _take_batch(self, payloads: Sequence[Payload]) -> list[Output]:
         """Use a batch of payloads and return the outputs to publish; note its statistics in `last`."""
         begun = perf_counter()
         messages = read_messages(payloads)
-        names = {name for message in messages if (name := plant_of(message)) is not None}
+        names = {name for message in messages if (name := find_plant_name(message)) is not None}
         self._load_plants(names)
         # If another process has committed one of the plants, read it again and repeat.
         while True:
@@ -235,8 +235,8 @@ class Service:
         """
         outcomes = self._intake.apply_batch(messages, self._damage, datetime.now(UTC))
         touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}
-        self._tell_doubts(list(touched.values()))
-        entries, malformed, known = self._report_unused(messages, payloads, outcomes)
+        self._warn_of_doubts(list(touched.values()))
+        entries, malformed, known = self._make_entries_on_unused(messages, payloads, outcomes)
         # Step what is due; estimates of final rows are committed, provisional ones and messages only published.
         sent = self._exchange.make_messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
@@ -255,7 +255,7 @@ class Service:
         self.known += known
         return outputs + sent + provisional, committed
 
-    def _tell_doubts(self, plants: Sequence[PlantState]) -> None:
+    def _warn_of_doubts(self, plants: Sequence[PlantState]) -> None:
         """Say what is new of these plants: angles known too little, readings that repeat, remarks of filters."""
         if self._doubt is not None:
             for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
@@ -264,8 +264,8 @@ class Service:
             if self._doubt is not None:
                 self._doubt(f"warning: plant {name!r}, {line}")
 
-    def _report_unused(
-        self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[Outcome]
+    def _make_entries_on_unused(
+        self, messages: Sequence[Read], payloads: Sequence[Payload], outcomes: Sequence[MessageOutcome]
     ) -> tuple[list[Entry], int, int]:
         """Return entries on messages that were not used, or not wholly; how many were malformed, and how many known.
 
@@ -277,34 +277,34 @@ class Service:
             if outcome.verdict == "used" and not outcome.notes:  # as most are
                 continue
             # Of a plant that is damaged in the store; a text is a message that could not be read, of no known plant.
-            damage = self._damage.get(plant_of(message) or "")
+            damage = self._damage.get(find_plant_name(message) or "")
             if damage and not isinstance(message, str):
-                entries.append(refuse_message(message, "damaged", damage))
+                entries.append(make_refusal_of_message(message, "damaged", damage))
                 continue
             # Not read, or of another kind than its plant expects.
             if isinstance(message, str | UnreadMessage) or outcome.verdict is None:
                 malformed += 1
                 is_explained = isinstance(payload, str | UnreadMessage)  # by who read it: then it need not be shown
                 why = outcome.why if is_explained else f"{outcome.why}: {show_value(payload)}"
-                entries.append(refuse_message(message, "malformed", why))
+                entries.append(make_refusal_of_message(message, "malformed", why))
                 continue
             known += outcome.verdict in ("duplicate", "late")
-            entries += self._explain_refusal(message, outcome)
+            entries += self._make_refusal_entries(message, outcome)
         return entries, malformed, known
 
-    def _explain_refusal(self, message: AnyMessage, outcome: Outcome) -> list[Entry]:
+    def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
 
         `outcome` has a verdict other than "used", or notes on parts of the message.
         """
-        entries = [refuse_message(message, "implausible", note) for note in outcome.notes]
+        entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":
-            entries.insert(0, refuse_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
+            entries.insert(0, make_refusal_of_message(message, outcome.verdict, outcome.why or WHY[outcome.verdict]))
         if outcome.verdict == "implausible" or outcome.notes:
-            self._warn(message, outcome.why or outcome.notes[0])
+            self._warn_of_implausible(message, outcome.why or outcome.notes[0])
         return entries
 
-    def _warn(self, message: AnyMessage, why: str) -> None:
+    def _warn_of_implausible(self, message: AnyMessage, why: str) -> None:
         """Report the first implausible message, once."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
@@ -367,7 +367,7 @@ class Service:
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
-            yield write_refusal(plant.name, parts, "future", LEAPT)
+            yield make_refusal_entry(plant.name, parts, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, their forecasts, and what the senders' silence means."""

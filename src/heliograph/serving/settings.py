@@ -9,8 +9,8 @@ from heliograph.files.sources.json_field import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Options
 from heliograph.numerics.check import TINY, check_count, fail, scalar
+from heliograph.serving.brokers.broker_address import Address
 from heliograph.serving.brokers.transport import encode_name
-from heliograph.serving.brokers.url import Address
 from heliograph.serving.published_forecasts import Spans
 from heliograph.serving.thresholds import Thresholds
 from heliograph.simulation.centres.node_filter import node_network
@@ -102,7 +102,7 @@ class ServiceSettings:
             raise fail("--parts", "messages in our own form, which name their part", "sources in the network's file")
 
 
-def choose_store(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
+def choose_store_location(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
     """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
 
     None keeps no state. Processes that share `parts` have no such default, and must all name the store.

@@ -71,7 +71,7 @@ def check_threshold_names(network: Network, thresholds: Thresholds) -> None:
             raise fail("--threshold", f"a state or output: {', '.join(known)}", repr(threshold.name))
 
 
-def find_crossings(
+def find_crossing_probabilities(
     source: HasOrigin, place: tuple[str, str], thresholds: Thresholds, horizons: list[float], whole: bool
 ) -> dict[str, list[dict[str, float]]]:
     """Return by threshold the probabilities that it is crossed at each horizon, and by then, as they are published.

@@ -7,9 +7,9 @@ from time import sleep
 from typing import TypeVar
 
 from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST
-from heliograph.serving.loop import BatchService
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
+from heliograph.serving.service_loop import BatchService
 from heliograph.serving.storage.store_protocol import AwayError
 
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from heliograph.live import LinkCounts
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored.plant_codec import unpack_plant
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.serving.storage.store import Store

@@ -11,13 +11,13 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving import make_transport
-from heliograph.serving.brokers.url import Address, parse_address
-from heliograph.serving.loop import serve_until
+from heliograph.serving.brokers.broker_address import Address, parse_address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
+from heliograph.serving.service_loop import serve_until
 from heliograph.serving.storage.store import Store
 from heliograph.serving.storage.store_protocol import InMemoryStore, identity
 from heliograph_studies.live.server import Server

@@ -21,8 +21,13 @@ import heliograph as hg
 from heliograph.factors.square_root_update import observe_information, roots_of
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.model import Paths, PlantSteps, compute_error_covariances, compute_path_information
-from heliograph.planning.paths.relaxation import compute_envelope, split_paths
+from heliograph.planning.multihop_paths.model import (
+    Paths,
+    PlantSteps,
+    compute_error_covariances,
+    compute_path_information,
+)
+from heliograph.planning.multihop_paths.power_split_over_hops import compute_envelope, split_paths
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step
 

@@ -6,8 +6,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.filters import chunks
-from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
+from heliograph.learning.parametric_network import describe
 
 ROWS = 40_001  # a chunk that is not full at the end
 RNG = np.random.default_rng(11)

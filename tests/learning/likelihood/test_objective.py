@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.free_network import describe
 from heliograph.learning.likelihood import LikelihoodData, LikelihoodSurface, make_objectives
 from heliograph.learning.likelihood.evaluation import _by_xla
+from heliograph.learning.parametric_network import describe
 
 STEPS, RECORDINGS = 157, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.live.stored import pack, unpack_snapshot
+from heliograph.live.stored import pack_snapshot, unpack_snapshot
 from heliograph.live.stored.plant_codec import HEAD
 
 SENSOR = hg.LinearSensor([[1.0]], 0.5)
@@ -33,7 +33,7 @@ def written_before(data):
     nodes = {node: [0, 9, at, 0, latest] for node, (at, latest) in leap["moments"].items()}
     text = json.dumps(of_plant | {"leap": [leap["time"], leap["now"], nodes]}).encode()
     again = HEAD.pack(len(text), *counts) + text + plant[HEAD.size + length :]
-    return pack(head, arrays | {"plant": np.frombuffer(again, np.uint8)})
+    return pack_snapshot(head, arrays | {"plant": np.frombuffer(again, np.uint8)})
 
 
 @pytest.mark.parametrize("time", [6, 10**9 + 1], ids=["taken back", "confirmed"])

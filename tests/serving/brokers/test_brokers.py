@@ -14,8 +14,8 @@ import nats
 import nats.js.errors
 
 from heliograph.serving import make_transport
+from heliograph.serving.brokers.broker_address import parse_address
 from heliograph.serving.brokers.transport import Part, TakenOverError, encode_name, part_of
-from heliograph.serving.brokers.url import parse_address
 from heliograph.serving.output import Output
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import KINDS, at, made, numbered, published, received, running, sent, silent

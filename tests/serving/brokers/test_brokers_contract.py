@@ -15,8 +15,8 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.serving import make_transport
-from heliograph.serving.brokers.contract import check_transport
 from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.transport_contract import check_transport
 from heliograph.serving.output import Output
 from heliograph_studies.live.server import Server
 from tests.serving.broker_servers import KINDS, at, published, running, sent, silent

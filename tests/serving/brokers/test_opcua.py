@@ -11,12 +11,12 @@ from asyncua import Server, ua
 import heliograph as hg
 from heliograph.files.source_suggestions import suggest_sources
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.serving import make_transport
 from heliograph.serving.brokers import listen
+from heliograph.serving.brokers.broker_address import parse_address
 from heliograph.serving.brokers.opcua import Reporting, read_reporting
-from heliograph.serving.brokers.translator import Translator
-from heliograph.serving.brokers.url import parse_address
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.service import Service
 from heliograph.serving.storage import InMemoryStore
 from heliograph_studies.live.server import free_port

@@ -9,11 +9,11 @@ from time import monotonic, sleep
 
 import pytest
 
-from heliograph.serving import loop
+from heliograph.serving import service_loop
 from heliograph.serving.brokers.pipe import Pipe
-from heliograph.serving.loop import keep_running
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
+from heliograph.serving.service_loop import keep_running
 from heliograph.serving.storage import InMemoryStore
 from tests.serving.worlds import fleet, lines, messages, stepping
 
@@ -112,7 +112,7 @@ def serve(service, source, target, after):
 
 
 def test_a_slow_reader_slows_the_sender_and_stopping_waits_for_it_no_longer_than_it_must(monkeypatch):
-    monkeypatch.setattr(loop, "PATIENCE", 0.2)
+    monkeypatch.setattr(service_loop, "PATIENCE", 0.2)
     (source, sender), (reader, target) = os.pipe(), os.pipe()
     os.set_blocking(sender, False)
     service, written = Counting(), 0
@@ -190,7 +190,7 @@ def test_a_sender_that_is_ahead_fills_a_batch_and_a_reader_gets_all_of_it():
 
 def test_a_service_that_computes_when_it_is_said_to_stop_is_not_waited_for(monkeypatch, caplog):
     """As where it compiles programs, which cannot be interrupted: what it was taking comes again."""
-    monkeypatch.setattr(loop, "PATIENCE", 0.1)
+    monkeypatch.setattr(service_loop, "PATIENCE", 0.1)
     (source, sender), (reader, target) = os.pipe(), os.pipe()
     service, computed = Counting(), Event()
     monkeypatch.setattr(service, "take", lambda payloads: computed.wait(60) and [])

@@ -22,7 +22,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 import heliograph as hg
 from heliograph import cli
 from heliograph.serving import LineReader, make_transport
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.message import Message
 from heliograph_studies.live.server import Server, free_port
 from tests.serving.broker_servers import KINDS, at, running
@@ -154,7 +154,7 @@ def test_lines_without_a_topic_are_of_the_only_one(file):
 
 def test_sources_and_parts_exclude_each_other():
     from heliograph.live.fleet import Options
-    from heliograph.serving.brokers.url import parse_address
+    from heliograph.serving.brokers.broker_address import parse_address
     from heliograph.serving.settings import ServiceSettings
 
     plant, sensor = hg.LinearPlant([[1.0]], [[1.0]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 1.0)

@@ -18,7 +18,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.fleet import Fleet, Options
-from heliograph.live.network_program import NetworkProgram
+from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.stored import PlantMigration
 from heliograph.serving.service import Service
 from heliograph.serving.storage import Store, identity

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 import heliograph as hg
 from heliograph.planning import Error, independent_paths, split_power
-from heliograph.planning.paths.model import compute_path_information
+from heliograph.planning.multihop_paths.model import compute_path_information
 from heliograph_studies.theory.sending import (
     best_schedule,
     burst_sending,

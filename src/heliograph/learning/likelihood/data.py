@@ -115,7 +115,7 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
     """
     held = getattr(recording, "measurements", recording)
     given_inputs = getattr(recording, "inputs", None) if inputs is None else inputs
-    by_node = _name_nodes(network, recording, held)
+    by_node = _arrange_by_node(network, recording, held)
     # The times of the rows are those that the recording holds, or the dates in the index of its tables.
     clock = getattr(recording, "time", None)
     if isinstance(clock, np.ndarray):
@@ -129,7 +129,7 @@ def _split_runs(network: Network, recording: Any, inputs: Any) -> list[tuple[np.
     return [_join_nodes(network, run, given_inputs) for run in runs]
 
 
-def _name_nodes(network: Network, recording: Any, held: Any) -> Mapping[str, Any]:
+def _arrange_by_node(network: Network, recording: Any, held: Any) -> Mapping[str, Any]:
     """Return the measurements `held` by a recording as {node: measurements}; a plain array is the only node's.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Likelihood, scores and information of recordings at points of the line, of long ones in chunks side by side."""
+"""Log-likelihood, scores and information of recordings at points; long recordings in chunks side by side."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.learning.likelihood.data import LikelihoodData
-from heliograph.learning.likelihood.objective import Objective, filter_of
+from heliograph.learning.likelihood.objective import Objective, make_filter_of_form
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.gaussian_density import differentiate_log_density
 from heliograph.numerics.types import Array, Float
@@ -183,7 +183,7 @@ def _differentiate_errors(
 @lru_cache
 def _find_kalman_filter(objective: Objective) -> Any:
     """Return the filter at the objective's start if it is linear with known gains (it has `score_rows`); else None."""
-    start = filter_of(objective.description.start, objective.form)
+    start = make_filter_of_form(objective.description.start, objective.form)
     return start if start.has_known_gain else None
 
 

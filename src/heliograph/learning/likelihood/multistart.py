@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, Maximum, maximise
+from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, ClimbEnds, maximise_from_starts
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
@@ -27,7 +27,7 @@ SEEN = 2.0  # nats by which a likelihood has fallen where a number is seen
 AT_ONE_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
 SADDLE = -1e-3  # curvature in units of standard errors below which a point is no maximum
 
-Watch = Callable[[Maximum], None]
+Watch = Callable[[ClimbEnds], None]
 
 
 class HighestPoint(NamedTuple):
@@ -91,7 +91,7 @@ class MaximumSearch:
         top = self._prove_maximum(climbed)
         self.best, ends = top._replace(converged=False, reason=""), climbed.total
         if len(starts) > 1:
-            around = self._draw_around(top, len(starts) - 1, seed)
+            around = self._draw_starts_around(top, len(starts) - 1, seed)
             # What climbs to the top joins it.
             climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, len(around))
             ends = np.concatenate([ends, climbed.total[:-1]])
@@ -100,7 +100,7 @@ class MaximumSearch:
         self.best, self.ends = top, -np.sort(-np.nan_to_num(ends, nan=-np.inf))
         return top
 
-    def _prove_maximum(self, climbed: Maximum) -> HighestPoint:
+    def _prove_maximum(self, climbed: ClimbEnds) -> HighestPoint:
         """Return the best of some climbs, once it is a maximum, with numbers put at the ends of their domains.
 
         While it is none it climbs again, ROUNDS times at most; then the point says why it is none.
@@ -109,17 +109,17 @@ class MaximumSearch:
         log-likelihood l and the Hessian H of -l, which is not indefinite; and if l does not rise inwards at any end.
         """
         no_ends = np.zeros(climbed.x.shape[1])
-        top = _take_best(climbed, no_ends)
+        top = _take_best_climb(climbed, no_ends)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
             again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
                 reason = self._explain_unbounded(top) or reason
                 return top._replace(converged=not reason, reason=reason)
-            top = _take_best(self._climb(again, no_ends), no_ends)
+            top = _take_best_climb(self._climb(again, no_ends), no_ends)
         return top._replace(converged=False, reason="the search went to and fro between two points")
 
-    def _draw_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
+    def _draw_starts_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return `count` points drawn around a maximum, and one more near each end of a domain.
 
         Logarithms and logits are within SPREAD of it, real numbers some standard errors away.
@@ -131,13 +131,13 @@ class MaximumSearch:
         # A number at an end is drawn around the point furthest inside at which the likelihood has not fallen by SEEN.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
-            _, rise = self._look_inwards(top, int(index))
+            _, rise = self._evaluate_inwards_of_end(top, int(index))
             centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
         points = centre + drawn * spread
         points[count + np.arange(len(with_ends)), with_ends] -= LOWERED
-        return (self.surface.of_first_rows() or self.surface).move_to_possible(points, top.x)
+        return (self.surface.of_first_rows() or self.surface).move_to_finite_likelihood(points, top.x)
 
-    def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> Maximum:
+    def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> ClimbEnds:
         """Return the ends of climbs as `_climb` does; in a long recording its first rows lead them most of the way.
 
         Starts that the first rows lead to one point climb by all rows together from there.
@@ -153,7 +153,7 @@ class MaximumSearch:
             return self._climb(starts, ends)
         others, x = np.arange(len(starts)) != own, starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
-        led = maximise(short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True)
+        led = maximise_from_starts(short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True)
         x[others] = led.x
         # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `lanes` are the
         # starts that climb, and `lane_of_start` which of these stands for each.
@@ -161,24 +161,24 @@ class MaximumSearch:
         reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         lanes, lane_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
-        climbed = self._climb(self.surface.move_to_possible(x[lanes], starts[own]), ends)
+        climbed = self._climb(self.surface.move_to_finite_likelihood(x[lanes], starts[own]), ends)
         by_start = {name: leaf if name == "steps" else leaf[lane_of_start] for name, leaf in climbed._asdict().items()}
-        return Maximum(**by_start)
+        return ClimbEnds(**by_start)
 
-    def _climb(self, starts: np.ndarray, ends: np.ndarray) -> Maximum:
+    def _climb(self, starts: np.ndarray, ends: np.ndarray) -> ClimbEnds:
         """Return the ends of climbs from all starts (starts, p), coordinates at an end (not 0 in `ends`) held there.
 
         The best point so far is kept at each step.
         """
 
-        def keep_best(now: Maximum) -> None:
-            top = _take_best(now, ends)
+        def keep_best(now: ClimbEnds) -> None:
+            top = _take_best_climb(now, ends)
             if self.best is None or not top.total < self.best.total:
                 self.best = top._replace(converged=False, reason="")
             self.watch(now)
 
         moving = np.repeat((ends == 0)[None], len(starts), axis=0)
-        return maximise(
+        return maximise_from_starts(
             self.surface.evaluate, starts, moving, watch=keep_best, domains=self.surface.domains, joining=True
         )
 
@@ -199,7 +199,7 @@ class MaximumSearch:
                 x, total, ends[index] = moved, float(there.total[0]), side
         if np.array_equal(ends, top.ends):
             return top
-        return _take_best(self._climb(x[None], ends), ends)
+        return _take_best_climb(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
         """Return points from which to climb again if `top` is no maximum, or None; and why it is none, else "".
@@ -208,7 +208,7 @@ class MaximumSearch:
         on the way back inside. At a saddle climbs begin to both sides of it.
         """
         for index in np.flatnonzero(top.ends):
-            points, rise = self._look_inwards(top, int(index))
+            points, rise = self._evaluate_inwards_of_end(top, int(index))
             if rise.max() > SAME:
                 return points[[int(rise.argmax())]], ""
         curvature = self.surface.measure_curvature(top.x, top.active)
@@ -230,7 +230,7 @@ class MaximumSearch:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
-    def _look_inwards(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate_inwards_of_end(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is there.
 
         `index`: coordinate of the number; `top`: the point at the end.
@@ -240,7 +240,7 @@ class MaximumSearch:
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 
-def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
+def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
     """Return the best of the climbs, with why it stopped if it did not converge.
 
     `ends`: -1 or 1 where a coordinate was held at an end of its domain, else 0 (p,).
@@ -252,12 +252,12 @@ def _take_best(climbed: Maximum, ends: np.ndarray) -> HighestPoint:
         ends=ends,
         total=float(climbed.total[lane]),
         converged=converged,
-        reason="" if converged else _explain_end(remaining),
+        reason="" if converged else _explain_unconverged_climb(remaining),
         steps=climbed.steps,
     )
 
 
-def _explain_end(remaining: float) -> str:
+def _explain_unconverged_climb(remaining: float) -> str:
     """Return in words why a climb ended that did not converge, by what a further step still promises in nats."""
     if not np.isfinite(remaining):
         return "the likelihood has no finite derivatives there"

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_for_likelihood import likelihood_filter
-from heliograph.learning.free_network import Build, Description
-from heliograph.model.augmented.joint_sensors import join_links
+from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.learning.parametric_network import Build, Description
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first
@@ -26,7 +25,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 
-def join_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
+def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and sensor and channel of all nodes together, in their order, given that all packets arrive.
 
     Raises:
@@ -77,14 +76,14 @@ class Objective:
         return isinstance(other, Objective) and are_same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
-        return hash((_list_identity(self.description.build)[0], self.form))
+        return hash((_list_code_and_closure(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
         """Return a tuple of all by which one objective may differ from another, to be compared."""
         description = self.description
         return (
             self.form,
-            _list_identity(description.build),
+            _list_code_and_closure(description.build),
             description.parameters,
             description.named,
             description.start,
@@ -92,7 +91,7 @@ class Objective:
 
     def filter(self, x: Array) -> AbstractFilter:
         """Return the filter of this form at a point x (p,) of the line."""
-        return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
+        return make_filter_of_form(self.description.at(self.description.parameters.values(x)), self.form)
 
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
@@ -129,7 +128,7 @@ class Objective:
         return wrap_near(jnp.asarray(truth), mean, angles) - mean, covariance
 
 
-def _list_identity(build: Build) -> tuple[object, ...]:
+def _list_code_and_closure(build: Build) -> tuple[object, ...]:
     """Return what makes two functions the same, their code and all that they close over; of another callable itself."""
     if not isinstance(build, FunctionType):
         return (build,)
@@ -149,19 +148,19 @@ def make_objectives(network: Description, by_truth: bool = False) -> list[Object
     """
     if by_truth:
         find_sole_filter(network.start)
-        return [_reuse_equal(Objective(network, "truth"))]
-    return [_reuse_equal(Objective(network, form)) for form in list_forms(network.start)]
+        return [_reuse_equal_objective(Objective(network, "truth"))]
+    return [_reuse_equal_objective(Objective(network, form)) for form in list_forms(network.start)]
 
 
 @lru_cache
-def _reuse_equal(objective: Objective) -> Objective:
+def _reuse_equal_objective(objective: Objective) -> Objective:
     """Return the first objective that equals this one, so that its compiled program is found without a comparison."""
     return objective
 
 
 def list_forms(network: Network) -> list[Form]:
     """Return the forms of the likelihood that a network allows, "linear" before "conditional"."""
-    plant, sensor, channel = join_world(network)
+    plant, sensor, channel = join_all_nodes(network)
     link = first(channel)
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
         if link.past:
@@ -174,11 +173,11 @@ def list_forms(network: Network) -> list[Form]:
     return ["linear", "conditional"]
 
 
-def filter_of(network: Network, form: Form) -> AbstractFilter:
+def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:
     """Return the filter of all that a network receives with a likelihood of this form; "truth": the network's own."""
     if form == "truth":
         return find_sole_filter(network)
-    plant, sensor, channel = join_world(network)
+    plant, sensor, channel = join_all_nodes(network)
     return likelihood_filter(plant, sensor, channel, form == "linear")
 
 

@@ -194,13 +194,13 @@ def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], par
     """
     y, spread, z = expected
     blocks = [
-        _score_block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
+        _score_stack_parts(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
         for i in range(0, max(len(z), 1), ROWS)
     ]
     return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
-def _score_block(
+def _score_stack_parts(
     y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: ChannelDensities
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it.

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.learning.free_parameters import Parameter
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
-from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise
+from heliograph.learning.likelihood.trust_region import Evaluated, OpenEnds, maximise_from_starts
 from heliograph.learning.likelihood.trust_region_step import FLAT
-from heliograph.learning.parameters import Parameter
 from heliograph.numerics.types import Bool, Float
 
 DIFFERENCE = 1e-3  # standard errors over which scores are differenced
@@ -27,7 +27,7 @@ LONG = 1 << 17  # rows
 TINY = 1e-300
 
 
-class Curvature(NamedTuple):
+class LeastCurvature(NamedTuple):
     """Least eigenvalue of the Hessian of -l in standard errors, its direction (p,), and g' |H|^-1 g / 2."""
 
     least: float
@@ -132,7 +132,7 @@ class LikelihoodSurface:
         information: np.ndarray = np.diag(self.evaluations(x[None]).information[0])
         return np.where(information > 0, 1 / np.sqrt(np.where(information > 0, information, 1.0)), np.inf)
 
-    def move_to_possible(
+    def move_to_finite_likelihood(
         self, points: Float[np.ndarray, "points p"], near: Float[np.ndarray, " p"]
     ) -> Float[np.ndarray, "points p"]:
         """Return the points with finite l, and others moved towards `near` (p,), where it is finite, until it is.
@@ -147,7 +147,7 @@ class LikelihoodSurface:
             points[is_impossible] = (points[is_impossible] + near) / 2
         return points
 
-    def measure_curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Curvature:
+    def measure_curvature(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> LeastCurvature:
         """Return the least curvature of -l at x, its direction, and what a step by the Hessian would gain.
 
         Among `active` coordinates (p,), along directions that the data identify, in units of standard errors.
@@ -160,20 +160,20 @@ class LikelihoodSurface:
         eigenvalues, directions = np.linalg.eigh(information * unit[:, None] * unit)
         basis = unit[:, None] * directions[:, eigenvalues > FLAT]
         if not basis.size:
-            return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
+            return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
         # The Hessian along these; where it is not finite nothing is known of the gain, which may be any.
         observed = basis.T @ self.hessian(x, active)[np.ix_(places, places)] @ basis
         if not np.isfinite(observed).all():
-            return Curvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
+            return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=np.inf)
         curvatures, vectors = np.linalg.eigh(observed)
         direction = np.zeros(len(x))
         direction[places] = basis @ vectors[:, 0]
         # g' |H|^-1 g / 2, in the Hessian's eigenvectors.
         slopes = vectors.T @ basis.T @ gradient
         gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
-        return Curvature(least=float(curvatures[0]), direction=direction, gain=gain)
+        return LeastCurvature(least=float(curvatures[0]), direction=direction, gain=gain)
 
-    def find_crossings(
+    def find_profile_crossings(
         self,
         x: Float[np.ndarray, " p"],
         top: float,
@@ -208,7 +208,7 @@ class LikelihoodSurface:
         for _ in range(CUTS):
             # The profile at these distances: l with the other coordinates at their best.
             points[:, coordinate] = x[coordinate] + side * distance
-            climbed = maximise(self.evaluate, points, moving, domains=self.domains, close=ENOUGH)
+            climbed = maximise_from_starts(self.evaluate, points, moving, domains=self.domains, close=ENOUGH)
             with np.errstate(over="ignore"):  # of an infinite fall
                 fall = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
             # Narrow the bracket: `inside` has not fallen to the target, `outside` has fallen further.
@@ -226,11 +226,11 @@ class LikelihoodSurface:
             # coordinates are at their best.
             with np.errstate(all="ignore"):
                 newton = distance + (target - fall) * fall / (-side * climbed.gradient[:, coordinate])
-            distance = np.where(done, distance, _choose_distance(newton, distance, inside, outside, furthest))
+            distance = np.where(done, distance, _choose_next_distances(newton, distance, inside, outside, furthest))
         return np.asarray(x[coordinate] + side * distance)  # the last points, after CUTS rounds
 
 
-def _choose_distance(
+def _choose_next_distances(
     newton: np.ndarray, distance: np.ndarray, inside: np.ndarray, outside: np.ndarray, furthest: float
 ) -> np.ndarray:
     """Return the distances to look at next (lanes,): Newton's where it lies inside the bracket, else its middle.

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.learning.likelihood.trust_region_step import (
     expected_gain,
-    find_flat_directions,
+    find_errors_and_flat_directions,
     multiply_lanes,
     trust_region_step,
 )
@@ -61,7 +61,7 @@ class OpenEnds(NamedTuple):
         return np.asarray(~(self.low | self.high))
 
 
-class Maximum(NamedTuple):
+class ClimbEnds(NamedTuple):
     """Ends of the searches, one a lane.
 
     x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
@@ -83,7 +83,7 @@ class Maximum(NamedTuple):
         return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
 
 
-class _State(NamedTuple):
+class _Lanes(NamedTuple):
     """Lanes (searches side by side) between two steps.
 
     x: points (lanes, p). total: log-likelihood l there (lanes,), gradient (lanes, p), information I (lanes, p, p).
@@ -103,24 +103,24 @@ class _State(NamedTuple):
     converged: np.ndarray
     joined: np.ndarray
 
-    def ends(self, steps: int) -> Maximum:
+    def ends(self, steps: int) -> ClimbEnds:
         """Return where the lanes are after so many steps; one that has joined another is where that one is."""
         lane = self.joined
         for _ in range(len(lane)):  # a lane may join one that joins a third
             lane = lane[lane]
         x, total, gradient = self.x[lane], self.total[lane], self.gradient[lane]
-        return Maximum(x, total, gradient, self.converged[lane], self.remaining[lane], steps)
+        return ClimbEnds(x, total, gradient, self.converged[lane], self.remaining[lane], steps)
 
 
-def maximise(
+def maximise_from_starts(
     evaluate: Evaluate,
     start: Float[np.ndarray, "lanes p"],
     active: Bool[np.ndarray, "lanes p"] | None = None,
-    watch: Callable[[Maximum], None] | None = None,
+    watch: Callable[[ClimbEnds], None] | None = None,
     domains: OpenEnds | None = None,
     close: float = CLOSE,
     joining: bool = False,
-) -> Maximum:
+) -> ClimbEnds:
     """Return where climbs of the log-likelihood l end, one climb (a lane) from each start, all side by side.
 
     Each step p of a lane maximises the model g' p - p' B p / 2 of the gain over |D p| <= radius: g is the gradient of
@@ -157,14 +157,14 @@ def maximise(
     return state.ends(MOST_STEPS)
 
 
-def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
+def _init_lanes(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state of all lanes before the first step, at the points `start` (lanes, p).
 
     A lane is done from the beginning where the log-likelihood, or a derivative in a coordinate that moves (`moving`,
-    (lanes, p)), is not finite there. For `domains` and `close` see `maximise`.
+    (lanes, p)), is not finite there. For `domains` and `close` see `maximise_from_starts`.
     """
     total, gradient, information = evaluate(start)
-    state = _State(
+    state = _Lanes(
         x=start.copy(),
         total=total,
         gradient=gradient,
@@ -189,13 +189,13 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
     return np.asarray(np.isfinite(total) & derivatives & np.all(np.isfinite(information) | ~pairs, axis=(1, 2)))
 
 
-def _mark_arrived(state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
+def _mark_arrived(state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state with those lanes done that have arrived, or whose radius has become as small as rounding.
 
     Twice what is left to gain, g' I^-1 g, is less than `close` in a lane that has arrived. Where the radius is so
     small rounding hides the gain, and NEAR is close enough to count as converged.
     """
-    counting = moving & ~find_at_limits(state.x, state.gradient, domains)
+    counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
     is_stuck = state.radius < SMALLEST_RADIUS
     has_arrived = ~state.done & (2 * remaining < np.where(is_stuck, NEAR, close))
@@ -204,7 +204,7 @@ def _mark_arrived(state: _State, moving: np.ndarray, domains: OpenEnds, close: f
     )
 
 
-def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
+def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "lanes p"]:
     """Return which coordinates are at an end of their domain, (lanes, p): on the way there l gains less than AT_LIMIT.
 
     A number v = exp(x) has its end v = 0 at x = -inf (`low`); where `high` too, as of a logit, its other end is at
@@ -220,7 +220,7 @@ def find_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bo
     return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
 
 
-def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: OpenEnds, close: float) -> _State:
+def _step_lanes(evaluate: Evaluate, state: _Lanes, moving: np.ndarray, domains: OpenEnds, close: float) -> _Lanes:
     """Return the state after one step in each lane that is not done: propose, evaluate, accept or reject, adapt.
 
     Args:
@@ -232,7 +232,7 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     """
     going = ~state.done
     # The best step by the quadratic model; coordinates that are at an end of their domain stay.
-    counting = moving & ~find_at_limits(state.x, state.gradient, domains)
+    counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     step, length, foretold = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
     )
@@ -243,8 +243,8 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     gradient_fell = expected_gain(gradient, information, counting) < expected_gain(
         state.gradient, state.information, counting
     )
-    accepted, radius = _judge_step(state, total, length, foretold, is_finite, gradient_fell)
-    model = _update_model(state, step, total - state.total, gradient, information, is_finite, accepted, domains.free)
+    accepted, radius = _accept_or_reject_steps(state, total, length, foretold, is_finite, gradient_fell)
+    model = _update_hessian(state, step, total - state.total, gradient, information, is_finite, accepted, domains.free)
     after = state._replace(
         x=np.where(accepted[:, None], tried, state.x),
         total=np.where(accepted, total, state.total),
@@ -256,8 +256,8 @@ def _step_lanes(evaluate: Evaluate, state: _State, moving: np.ndarray, domains: 
     return _mark_arrived(after, moving, domains, close)
 
 
-def _judge_step(
-    state: _State,
+def _accept_or_reject_steps(
+    state: _Lanes,
     total: np.ndarray,
     length: np.ndarray,
     foretold: np.ndarray,
@@ -290,7 +290,7 @@ def _judge_step(
     return accepted, np.where(foretold_badly, NARROWER * np.minimum(length, state.radius), widened)
 
 
-def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
+def _join_lanes(state: _Lanes, moving: np.ndarray, domains: OpenEnds) -> _Lanes:
     """Return the state in which each lane a is ended that climbs to the same top as a higher lane b: b is enough.
 
     Both are within JOINED standard errors of a top and of each other, by the information I of either, and neighbours in
@@ -320,7 +320,7 @@ def _join_lanes(state: _State, moving: np.ndarray, domains: OpenEnds) -> _State:
     return state._replace(joined=np.where(joins, best, state.joined), done=state.done | joins)
 
 
-def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _State) -> Evaluated:
+def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: _Lanes) -> Evaluated:
     """Return log-likelihood, gradient and information at x (lanes, p) in lanes `going` on; in others the last ones."""
     values = state.total.copy(), state.gradient.copy(), state.information.copy()
     for value, new in zip(values, evaluate(x[going]), strict=True):
@@ -328,8 +328,8 @@ def _evaluate_lanes(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state:
     return values
 
 
-def _update_model(
-    state: _State,
+def _update_hessian(
+    state: _Lanes,
     step: np.ndarray,
     gain: np.ndarray,
     gradient: np.ndarray,
@@ -367,7 +367,7 @@ def _update_model(
 def _correct_by_secant(
     model: np.ndarray,
     step: np.ndarray,
-    state: _State,
+    state: _Lanes,
     gradient: np.ndarray,
     is_finite: np.ndarray,
     free: np.ndarray,
@@ -392,7 +392,7 @@ def _correct_by_secant(
     r = np.where(free | (diagonal > INVISIBLE), r, 0.0)
     # r' p counts where it is more than rounding of |r| |p|, both in units of standard errors.
     r_times_step = np.sum(r * step, axis=1)
-    unit, _ = find_flat_directions(state.information, step != 0)
+    unit, _ = find_errors_and_flat_directions(state.information, step != 0)
     squared_r, squared_step = (r * unit) ** 2, (step / np.where(unit > 0, unit, 1.0)) ** 2
     size = np.sqrt(np.sum(squared_r, axis=1) * np.sum(squared_step, axis=1))
     is_defined = is_finite & (np.abs(r_times_step) > DEFINED * size)

@@ -55,7 +55,7 @@ def trust_region_step(
     """
     # g, D and B in standard errors. A coordinate that stays has a unit of 0 and 1 on the diagonals of D and B, so that
     # its step is 0. Columns of `flat` are the directions that are not identified, in these units.
-    unit, flat = find_flat_directions(information, moving)
+    unit, flat = find_errors_and_flat_directions(information, moving)
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
     g = np.nan_to_num(gradient) * unit
@@ -118,14 +118,14 @@ def expected_gain(
 
     Only coordinates that are `counting` (lanes, p), and directions that are identified, add to it.
     """
-    unit, _ = find_flat_directions(information, counting)
+    unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
     return np.asarray(np.sum(np.where(values > FLAT, along**2 / np.where(values > FLAT, values, 1.0), 0.0), axis=1))
 
 
-def find_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each coordinate's standard error if the others were known, (lanes, p), and directions without information.
 
     The errors are 0 of coordinates that stay (not `moving`). Directions are columns (lanes, p, p), in units of these

@@ -17,7 +17,7 @@ from .plant_codec import pack_plant as pack_plant
 from .plant_codec import unpack_plant as unpack_plant
 from .snapshot import Identity as Identity
 from .snapshot import check_same_network as check_same_network
+from .snapshot import list_versions as list_versions
 from .snapshot import network_identity as network_identity
-from .snapshot import pack as pack
+from .snapshot import pack_snapshot as pack_snapshot
 from .snapshot import unpack_snapshot as unpack_snapshot
-from .snapshot import versions as versions

@@ -62,7 +62,7 @@ def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
 
 
 @dataclass
-class _Part:
+class _StatePart:
     """A part of a filter's state in the columns of a row: its shape, its first column, and the end of its columns."""
 
     shape: Any
@@ -79,8 +79,8 @@ class _LostFlag(NamedTuple):
     """A flag whose columns are not known: the end of the part before it, itself, and the parts after it."""
 
     end_before: int
-    flag: _Part
-    after: list[_Part]
+    flag: _StatePart
+    after: list[_StatePart]
 
 
 def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
@@ -90,7 +90,7 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     their order, and the same part of filters that share a program side by side: so flags stand in the columns that no
     other part has, in the order of the parts before them.
     """
-    placed = {name: {path: _Part(*part) for path, part in parts.items()} for name, parts in filters.items()}
+    placed = {name: {path: _StatePart(*part) for path, part in parts.items()} for name, parts in filters.items()}
     taken: set[int] = set()
     found = [_take_columns(list(parts.values()), 0, taken) for parts in placed.values()]
     lost = [each for each in found if each is not None]
@@ -109,7 +109,7 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
     }
 
 
-def _take_columns(parts: list[_Part], end: int, taken: set[int]) -> _LostFlag | None:
+def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFlag | None:
     """Add the columns of a filter's parts to those taken, up to its first flag, which is returned; None without one.
 
     A flag's columns begin before the end of the part before it, or, of a flag that comes first, are taken already.

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.live.clock_leap import Leap
+from heliograph.live.clock_leap import ClockLeap
 from heliograph.live.fleet import Fleet
 from heliograph.live.link_counts import LinkCounts
-from heliograph.live.plant import BeforeLeap, PlantState
+from heliograph.live.plant_state import PlantState, RowBeforeLeap
 from heliograph.live.sorted_rows import HeldRow
 
 HEAD = struct.Struct("<4q")  # lengths: of the head in bytes, of rows, of events, of their values
@@ -117,7 +117,7 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     head, rows = parts.head, _make_rows_with_events(parts, fleet)
     # Where the head says when the last moment before a leap was, the first row is the one kept from before it.
     moment_before = head.get(BEFORE_LEAP)
-    kept = None if moment_before is None else BeforeLeap(rows.pop(0), moment_before)
+    kept = None if moment_before is None else RowBeforeLeap(rows.pop(0), moment_before)
     base = rows[0]
     sorted_rows = fleet.make_rows(base)
     sorted_rows.replace_rows(rows)
@@ -149,12 +149,12 @@ def _make_rows_with_events(parts: PlantParts, fleet: Fleet) -> list[HeldRow]:
     return rows
 
 
-def _pack_leap(leap: Leap) -> dict[str, Any]:
+def _pack_leap(leap: ClockLeap) -> dict[str, Any]:
     """Return {field of a leap: its value}, of which JSON can be written."""
     return leap._asdict() | {"earlier": None if leap.earlier is None else _pack_leap(leap.earlier)}
 
 
-def _unpack_leap(parts: Any) -> Leap:
+def _unpack_leap(parts: Any) -> ClockLeap:
     """Return the leap that `_pack_leap` packed, or a version until 0.3.0.
 
     Such a version wrote a list: its time, the arrival before it, and five numbers of each node.
@@ -162,9 +162,9 @@ def _unpack_leap(parts: Any) -> Leap:
     if isinstance(parts, list):
         time, now, links = parts
         moments = {node: (numbers[2], numbers[4]) for node, numbers in links.items()}  # `at` and `latest` of each
-        return Leap(time=time, since=time, now=now, moments=moments)
+        return ClockLeap(time=time, since=time, now=now, moments=moments)
     moments = {node: (at, latest) for node, (at, latest) in parts["moments"].items()}
-    return Leap(**parts | {"moments": moments, "earlier": parts["earlier"] and _unpack_leap(parts["earlier"])})
+    return ClockLeap(**parts | {"moments": moments, "earlier": parts["earlier"] and _unpack_leap(parts["earlier"])})
 
 
 def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) -> HeldRow:

@@ -18,7 +18,7 @@ from heliograph.simulation.network import Network
 Identity = dict[str, str]
 
 
-def versions() -> Identity:
+def list_versions() -> Identity:
     """Return the versions of this package and of JAX."""
     return {"heliograph": heliograph.__version__, "jax": jax.__version__}
 
@@ -32,7 +32,7 @@ def network_identity(network: Network, program: str, options: Mapping[str, objec
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
     return {
-        **versions(),
+        **list_versions(),
         "precision": "double",
         "states": ", ".join(network.states),
         "inputs": ", ".join(network.inputs),
@@ -69,7 +69,7 @@ def check_same_network(
 HEAD = "head"
 
 
-def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
+def pack_snapshot(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return a head and arrays as bytes."""
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
@@ -78,7 +78,7 @@ def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack_snapshot(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the head and the arrays, by name, of what `pack` wrote."""
+    """Return the head and the arrays, by name, of what `pack_snapshot` wrote."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -10,11 +10,11 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.learning.estimate_table import Row
 from heliograph.learning.fitting import Fit
-from heliograph.learning.held_out import Change, Uniformity
-from heliograph.learning.likelihood_maximum import Row
-from heliograph.learning.losses.losses import Losses
+from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
+from heliograph.learning.packet_losses.learn_losses import Losses
 from heliograph.report.figures import (
     AMBER,
     BLUE,
@@ -53,8 +53,8 @@ class FitResults:
     fit: Fit
     learned: int
     held_out: int
-    changes: list[Change]
-    uniform: list[Uniformity]
+    changes: list[PredictionBeforeAndAfter]
+    uniform: list[HeldOutTransforms]
     losses: dict[str, Losses]
 
     @property
@@ -111,7 +111,7 @@ def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float
 
 
 @matplotlib.rc_context(STYLE)
-def _draw_correlations(tested: list[Change]) -> Figure:
+def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
     """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
     figure, grid = make_stacked_panels(len(tested), 1.6, 0.7)
     for axes, change in zip(grid, tested, strict=True):
@@ -131,7 +131,7 @@ def _draw_correlations(tested: list[Change]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _draw_probability_transforms(received: list[Uniformity]) -> Figure:
+def _draw_pits(received: list[HeldOutTransforms]) -> Figure:
     """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()

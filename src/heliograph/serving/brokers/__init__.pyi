@@ -1,5 +1,7 @@
 """Names that other folders take; the package loads them when first used."""
 
+from .broker_address import Address as Address
+from .broker_address import parse_address as parse_address
 from .line_reader import LineReader as LineReader
 from .line_reader import redirected_file as redirected_file
 from .listening import listen as listen
@@ -12,9 +14,9 @@ from .replay import delay_as_traced as delay_as_traced
 from .replay import encode_messages as encode_messages
 from .replay import events_of_recording as events_of_recording
 from .replay import simulate_link as simulate_link
+from .source_translator import Translator as Translator
 from .state_topics import StatePublishing as StatePublishing
 from .state_topics import StateTopics as StateTopics
-from .translator import Translator as Translator
 from .transport import FIRST as FIRST
 from .transport import LOG as LOG
 from .transport import LONGEST as LONGEST
@@ -23,5 +25,3 @@ from .transport import TakenOverError as TakenOverError
 from .transport import Transport as Transport
 from .transport import WHOLE as WHOLE
 from .transport import encode_name as encode_name
-from .url import Address as Address
-from .url import parse_address as parse_address

@@ -13,8 +13,8 @@ from heliograph.files.messages.own_format import OwnMessageReader, is_own_messag
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
-from heliograph.serving.brokers.table_lines import TableLineReader, read_own_event
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
+from heliograph.serving.brokers.table_line_reader import TableLineReader, read_own_event
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
 

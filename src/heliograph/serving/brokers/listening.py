@@ -6,7 +6,7 @@ import time
 
 from heliograph.files.topic_inspection import TopicStatistics, note_payload
 from heliograph.numerics.check import fail
-from heliograph.serving.brokers.url import Address
+from heliograph.serving.brokers.broker_address import Address
 
 WAIT = 10.0  # seconds that a connection may take
 INTERNAL = ("$", "_INBOX")  # topics and subjects of the broker itself

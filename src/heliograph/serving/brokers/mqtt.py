@@ -12,9 +12,9 @@ from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage,
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.broker_address import Address
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.transport import FIRST, LOG, LONGEST, WHOLE, Batch, Part, explain_failure, topic_of
-from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 

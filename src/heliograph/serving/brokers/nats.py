@@ -23,7 +23,8 @@ from nats.js.api import (
 from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.broker_address import Address
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.transport import (
     FIRST,
     LOG,
@@ -35,7 +36,6 @@ from heliograph.serving.brokers.transport import (
     raise_if_cancelled,
     topic_of,
 )
-from heliograph.serving.brokers.url import Address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 

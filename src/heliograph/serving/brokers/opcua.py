@@ -17,10 +17,10 @@ from asyncua.ua.uaerrors import UaError
 from heliograph.files.topic_inspection import TopicStatistics, note_payload
 from heliograph.model.trigger import SendOnDelta
 from heliograph.numerics.check import fail, items, show_value, text
+from heliograph.serving.brokers.broker_address import Address, parse_address
 from heliograph.serving.brokers.pipe import Pipe
-from heliograph.serving.brokers.translator import Translator
+from heliograph.serving.brokers.source_translator import Translator
 from heliograph.serving.brokers.transport import Batch, Retry, acknowledge_nothing
-from heliograph.serving.brokers.url import Address, parse_address
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 

@@ -21,7 +21,7 @@ class StateMessage(NamedTuple):
     body: bytes
 
 
-class _State(NamedTuple):
+class _PublishedState(NamedTuple):
     """One state of one filter of a plant, and the topic of its messages."""
 
     plant: str
@@ -60,7 +60,7 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     estimate = from_json(body)
     moment = estimate["time"]
     time = parse_instant(moment).timestamp() if isinstance(moment, str) else moment
-    dead = _read_dead(estimate)
+    dead = _read_dead_senders(estimate)
     for place, i, message in _iterate_states(topic, states, estimate):
         covariance = message["covariance"]
         variance = None if covariance is None else covariance[i][i]
@@ -82,7 +82,7 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     plant = str(estimate["plant"])
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
-    nodes_with_senders = _read_dead(estimate).keys()
+    nodes_with_senders = _read_dead_senders(estimate).keys()
     for place, i, _ in _iterate_states(topic, states, estimate):
         common = {"state_topic": place.topic, "availability_topic": availability_topic(topic), "device": device}
         for sensor in _list_sensors(place, unit_of(states[i]), place.node in nodes_with_senders):
@@ -92,7 +92,7 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
             yield StateMessage(f"{prefix}/{sensor.kind}/{identity}/config", content)
 
 
-class _Sensor(NamedTuple):
+class _DiscoveredSensor(NamedTuple):
     """A sensor that Home Assistant shows: its kind there, the key of its value in a state's message, name, settings."""
 
     kind: str
@@ -101,27 +101,29 @@ class _Sensor(NamedTuple):
     settings: dict[str, Any]
 
 
-def _list_sensors(place: _State, unit: str | None, has_sender: bool) -> list[_Sensor]:
+def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
     """Return the sensors of a state: its value and deviation, and a dead sender, if its node has one that may be."""
     number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
     sensors = [
-        _Sensor("sensor", "value", place.label, number),
-        _Sensor("sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}),
+        _DiscoveredSensor("sensor", "value", place.label, number),
+        _DiscoveredSensor(
+            "sensor", "deviation", f"{place.label} deviation", number | {"entity_category": "diagnostic"}
+        ),
     ]
     if has_sender:
         dead = {"payload_on": "1", "payload_off": "0", "device_class": "problem"}
-        sensors.append(_Sensor("binary_sensor", "dead", f"{place.label} sender dead", dead))
+        sensors.append(_DiscoveredSensor("binary_sensor", "dead", f"{place.label} sender dead", dead))
     return sensors
 
 
-def _read_dead(estimate: Mapping[str, Any]) -> dict[str, int]:
+def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
     """Return 1 for each node whose sender is dead, 0 for each that lives, by node with such a sender."""
     return {node: int(sender["dead"]) for node, sender in estimate.get("senders", {}).items()}
 
 
 def _iterate_states(
     topic: str, states: Sequence[str], estimate: Mapping[str, Any]
-) -> Iterator[tuple[_State, int, Mapping[str, Any]]]:
+) -> Iterator[tuple[_PublishedState, int, Mapping[str, Any]]]:
     """Yield each state of each filter, with its number and the filter's estimate."""
     plant = str(estimate["plant"])
     for node, filters in estimate["estimates"].items():
@@ -129,4 +131,4 @@ def _iterate_states(
             words = [encode_name(word) for word in (plant, node, name)]
             for i, state in enumerate(states):
                 path = "/".join([topic, "state", *words, encode_name(str(state))])
-                yield _State(plant, node, name, str(state), path), i, message
+                yield _PublishedState(plant, node, name, str(state), path), i, message

@@ -9,6 +9,7 @@ from paho.mqtt.client import Client, ConnectFlags
 from paho.mqtt.reasoncodes import ReasonCode
 
 from heliograph.numerics.check import fail, instance, name_list
+from heliograph.serving.brokers.broker_address import Address
 from heliograph.serving.brokers.mqtt import AT_LEAST_ONCE, Connection
 from heliograph.serving.brokers.state_messages import (
     OFFLINE,
@@ -18,7 +19,6 @@ from heliograph.serving.brokers.state_messages import (
     make_state_messages,
 )
 from heliograph.serving.brokers.transport import Batch, Transport
-from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
 
 

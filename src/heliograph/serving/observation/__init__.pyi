@@ -2,4 +2,4 @@
 
 from .page import parse_page_address as parse_page_address
 from .page import serve_page as serve_page
-from .watch import watch_of as watch_of
+from .service_watch import watch_of as watch_of

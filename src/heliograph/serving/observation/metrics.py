@@ -8,10 +8,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from heliograph.live.event import VERDICTS
-from heliograph.model.checks.refusal_reasons import OF_NODES
-from heliograph.report.sensor_output_health import summarise_output
-from heliograph.serving.observation.last_answers import LastAnswers
-from heliograph.serving.observation.watch import Watch
+from heliograph.model.checks.refusals import OF_NODES
+from heliograph.report.outputs import summarise_output
+from heliograph.serving.observation.answers_between_batches import LastAnswers
+from heliograph.serving.observation.service_watch import ServiceWatch
 
 SHOWN = 50  # plants with metrics of their own; of more the worst
 NIS = {
@@ -32,7 +32,7 @@ OUTPUTS = {
 class ServiceMetrics(Collector):
     """Collector of the metrics of a watch: by node and filter, and by plant where there are few, else of the worst."""
 
-    def __init__(self, watch: Watch):
+    def __init__(self, watch: ServiceWatch):
         self.watch = watch
         watch.registry.register(self)
         text = partial(generate_latest, watch.registry)
@@ -57,7 +57,7 @@ class ServiceMetrics(Collector):
         return self._texts.ask()
 
 
-def _collect_plants(watch: Watch) -> Iterable[Metric]:
+def _collect_plants(watch: ServiceWatch) -> Iterable[Metric]:
     """Yield the tests of each plant where there are few, else of the worst, and how many plants are wrong."""
     worst, labels = watch.list_worst_plants(), ["plant", "node", "filter"]
     wrong = GaugeMetricFamily("heliograph_plants_wrong", "Plants with something wrong.", labels=["what"])
@@ -78,7 +78,7 @@ def _collect_plants(watch: Watch) -> Iterable[Metric]:
     return wrong, *families, dead
 
 
-def _collect_crossings(watch: Watch) -> Metric:
+def _collect_crossings(watch: ServiceWatch) -> Metric:
     """Return the metric of thresholds that may be crossed, of the plants in which that is most probable."""
     what = "Probability that a level of --threshold is passed by so far ahead."
     labels = ["plant", "node", "filter", "threshold", "ahead"]
@@ -88,7 +88,7 @@ def _collect_crossings(watch: Watch) -> Metric:
     return crossings
 
 
-def _collect_links(watch: Watch) -> Iterable[Metric]:
+def _collect_links(watch: ServiceWatch) -> Iterable[Metric]:
     """Return the metrics of the nodes' messages: by verdict, lost, what was refused by reason, and timeouts.
 
     Nodes whose messages carry no count have no number of lost ones.
@@ -117,7 +117,7 @@ def _collect_links(watch: Watch) -> Iterable[Metric]:
     return messages, lost, refused, timeouts, held
 
 
-def _collect_dead_senders(watch: Watch) -> Metric:
+def _collect_dead_senders(watch: ServiceWatch) -> Metric:
     """Return the metric of the dead senders, by node."""
     what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance, or is past its timeout."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
@@ -126,7 +126,7 @@ def _collect_dead_senders(watch: Watch) -> Metric:
     return dead
 
 
-def _collect_remarks(watch: Watch) -> Metric:
+def _collect_remarks(watch: ServiceWatch) -> Metric:
     """Return the metric of what filters say happened to their states."""
     what = "Times that a gate gave in: it took up what it had refused for long."
     gave_in = CounterMetricFamily("heliograph_gave_in", what, labels=["node", "filter"])
@@ -135,7 +135,7 @@ def _collect_remarks(watch: Watch) -> Metric:
     return gave_in
 
 
-def _collect_fusion_doubts(watch: Watch) -> Metric:
+def _collect_fusion_doubts(watch: ServiceWatch) -> Metric:
     """Return the metric of filters under fusions whose claims are doubted."""
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
@@ -144,7 +144,7 @@ def _collect_fusion_doubts(watch: Watch) -> Metric:
     return doubted
 
 
-def _collect_nis(watch: Watch) -> Iterable[Metric]:
+def _collect_nis(watch: ServiceWatch) -> Iterable[Metric]:
     """Return the metrics of each filter's NIS over its expectation, with the band in which it should be."""
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
@@ -158,7 +158,7 @@ def _collect_nis(watch: Watch) -> Iterable[Metric]:
     return ratio, low, high
 
 
-def _collect_outputs(watch: Watch) -> Iterable[Metric]:
+def _collect_outputs(watch: ServiceWatch) -> Iterable[Metric]:
     """Return the metrics of each output of filters that weigh, in OUTPUTS; none where there are too few rows."""
     metrics = {
         name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])

@@ -23,10 +23,10 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from heliograph.numerics.check import fail
-from heliograph.serving.observation.last_answers import LastAnswers
+from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.metrics import ServiceMetrics
-from heliograph.serving.observation.overview import make_plants_page
-from heliograph.serving.observation.watch import LISTED, Watch
+from heliograph.serving.observation.service_watch import LISTED, ServiceWatch
+from heliograph.serving.observation.trouble_overview import make_plants_page
 
 STUCK = 60.0  # seconds after which a batch that is being taken is no sign of health
 TOKEN = "HELIOGRAPH_PAGE_TOKEN"
@@ -97,12 +97,14 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def make_overview_page(watch: Watch) -> str:
+def make_overview_page(watch: ServiceWatch) -> str:
     """Return the page of all plants, the worst first."""
     return make_plants_page(watch.title, {name for name, _ in watch.plants()}, watch.list_worst_plants(), LISTED)
 
 
-def make_application(watch: Watch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()) -> Starlette:
+def make_application(
+    watch: ServiceWatch, token: str | None, stopped: asyncio.Event, hosts: Sequence[str] = ()
+) -> Starlette:
     """Return the web application: the page at /, its data at /events until `stopped`, metrics at /metrics.
 
     Without a token, or where `hosts` are given, it answers to these names and those of this machine alone.
@@ -165,7 +167,7 @@ def send_page_file(request: Request) -> Response:
     return Response(_read_page_file(name), media_type=KINDS[name], headers=POLICY)
 
 
-async def _yield_events(watch: Watch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
+async def _yield_events(watch: ServiceWatch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
     """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
     plant, since, before = request.query_params.get("plant"), 0, None
     while not (stopped.is_set() or await request.is_disconnected()):
@@ -222,7 +224,7 @@ class _PageServer(uvicorn.Server):
 
 
 @asynccontextmanager
-async def serve_page(watch: Watch, at: PageAddress) -> AsyncIterator[int]:
+async def serve_page(watch: ServiceWatch, at: PageAddress) -> AsyncIterator[int]:
     """Serve the page for the duration of a block, which receives its port.
 
     Args:

@@ -45,7 +45,7 @@ def read_location(location: str) -> URL:
     return url.set(drivername="postgresql+psycopg") if url.get_backend_name() == "postgresql" else url
 
 
-def is_away(error: SQLAlchemyError) -> bool:
+def is_server_away(error: SQLAlchemyError) -> bool:
     """Return whether an error means that a server does not answer, or ends its connections: it may answer later.
 
     One that answers and refuses, as for a wrong password, would refuse again.

@@ -11,12 +11,12 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.live.stored.migration import DESCRIPTION, LISTED, PlantMigration, list_changes
-from heliograph.live.stored.snapshot import Identity, check_same_network, versions
+from heliograph.live.stored.snapshot import Identity, check_same_network, list_versions
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.output import Output, parse_output
-from heliograph.serving.storage.database import is_away, open_database
-from heliograph.serving.storage.store_protocol import AwayError, ConflictError, Damage, Entry, StoredPlant
-from heliograph.serving.storage.tables import (
+from heliograph.serving.storage.database import is_server_away, open_database
+from heliograph.serving.storage.store_protocol import AwayError, ConflictError, DamagedRow, Entry, StoredPlant
+from heliograph.serving.storage.store_tables import (
     AT_ONCE,
     CARRIED,
     IDENTITY_TABLE,
@@ -26,11 +26,11 @@ from heliograph.serving.storage.tables import (
     NUMBERS,
     PLANTS,
     TABLES,
+    add_checksum,
     checksum,
-    is_named,
-    is_whole,
+    is_name_undamaged,
+    is_row_undamaged,
     select_plants,
-    with_checksum,
 )
 
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
@@ -105,7 +105,7 @@ class Store:
         # The network must be the same, unless its plants are carried over or any will do.
         if carrier is None and mine is not None:
             self._check_network(mine)
-        self.damaged: dict[str, Damage] = self._find_damaged() if opened is None else opened.damaged
+        self.damaged: dict[str, DamagedRow] = self._find_damaged() if opened is None else opened.damaged
         if carrier is not None and self.identity != carrier.mine | {LAYOUT_KEY: LAYOUT}:
             self.carry(carrier, f"store {self.name}", self.identity)
 
@@ -129,10 +129,10 @@ class Store:
         try:
             yield
         except UnicodeError:  # of a damaged one: the database's own complaint cites it
-            raise self._fail_unreadable("bytes that are no text") from None
+            raise self._make_unreadable_error("bytes that are no text") from None
         except SQLAlchemyError as error:
             said = getattr(error, "orig", None) or type(error).__name__
-            if is_away(error):
+            if is_server_away(error):
                 raise AwayError(str(fail(f"store {self.name}", "a server that answers", str(said)))) from None
             raise fail(f"store {self.name}", expected, str(said)) from None
 
@@ -145,7 +145,7 @@ class Store:
         # All tables are there, or none: a store with some missing is damaged.
         tables = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
         if tables and tables != set(TABLES.tables):
-            raise self._fail_unreadable(f"no table {', '.join(sorted(set(TABLES.tables) - tables))}")
+            raise self._make_unreadable_error(f"no table {', '.join(sorted(set(TABLES.tables) - tables))}")
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
             this = select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
@@ -153,7 +153,7 @@ class Store:
             if stored is None:
                 # A store without an identity is new, unless it has counted something.
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
-                    raise self._fail_unreadable("no network that it is of")
+                    raise self._make_unreadable_error("no network that it is of")
                 if mine is None:
                     raise fail(f"store {self.name}", "plants to begin from", "an empty one")
                 connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
@@ -161,7 +161,7 @@ class Store:
         try:
             identity = dict(json.loads(stored))
         except (ValueError, TypeError):
-            raise self._fail_unreadable("no network that it is of") from None
+            raise self._make_unreadable_error("no network that it is of") from None
         return {LAYOUT_KEY: "1"} | identity  # the first layout did not name itself
 
     def _check_layout(self, carried: bool) -> None:
@@ -170,24 +170,24 @@ class Store:
         if layout == LAYOUT or (carried and layout in CARRIED):
             return
         why = "" if layout in CARRIED else ", whose plants cannot be carried over"
-        raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {versions()['heliograph']}",
+        raise fail(f"store {self.name}", f"layout {LAYOUT}, of heliograph {list_versions()['heliograph']}",
                    f"layout {layout}, of heliograph {release}{why}")  # fmt: skip
 
-    def _find_damaged(self) -> dict[str, Damage]:
+    def _find_damaged(self) -> dict[str, DamagedRow]:
         """Return the plants with damaged rows, by name."""
-        results: dict[str, Damage] = {}
+        results: dict[str, DamagedRow] = {}
         with self._engine.connect() as connection:
             if self._engine.dialect.name == "sqlite":
                 said = connection.exec_driver_sql("PRAGMA integrity_check(1)").scalar()
                 if said != "ok":
-                    raise self._fail_unreadable(f"{said}")
+                    raise self._make_unreadable_error(f"{said}")
             for rows in connection.execution_options(yield_per=AT_ONCE).execute(select(PLANTS)).partitions():
                 for name, version, body, written in rows:
-                    if not is_whole(written, name, version, body):
-                        results[str(name)] = Damage(is_named(written, name), written)
+                    if not is_row_undamaged(written, name, version, body):
+                        results[str(name)] = DamagedRow(is_name_undamaged(written, name), written)
         return results
 
-    def _fail_unreadable(self, what: str) -> InputError:
+    def _make_unreadable_error(self, what: str) -> InputError:
         """Return the error of a store that cannot be read."""
         return fail(f"store {self.name}", "a database as it was written", f"one that is damaged: {what}")
 
@@ -204,7 +204,7 @@ class Store:
             rows = select_plants(connection, list(PLANTS.c), names)
         results = {}
         for name, version, body, written in rows:
-            if is_whole(written, name, version, body):
+            if is_row_undamaged(written, name, version, body):
                 results[name] = StoredPlant(version, body)
             else:
                 results[name] = StoredPlant(0, b"", damage=self._describe_damage(name, "a damaged one"))
@@ -263,15 +263,15 @@ class Store:
             # Plants with their next version, the batch in the journal, and the counts.
             if plants:
                 next_versions = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
-                self._upsert(connection, PLANTS, [with_checksum(PLANTS, *row) for row in next_versions])
+                self._upsert(connection, PLANTS, [add_checksum(PLANTS, *row) for row in next_versions])
             if outputs:
                 lines = b"\n".join([output.body for output in outputs]).decode()
-                connection.execute(JOURNAL.insert(), [with_checksum(JOURNAL, newest, self.process, lines)])
+                connection.execute(JOURNAL.insert(), [add_checksum(JOURNAL, newest, self.process, lines)])
                 connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
             if malformed:
                 self._add_to_count(connection, MALFORMED, malformed)
             if published is not None:
-                self._upsert(connection, NUMBERS, [with_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
+                self._upsert(connection, NUMBERS, [add_checksum(NUMBERS, PUBLISHED.format(self.process), published)])
         return outputs
 
     def unpublished(self) -> list[Output]:
@@ -293,7 +293,7 @@ class Store:
         outputs = list[Output]()
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             for last, by, lines, written in connection.execute(expected):
-                if not is_whole(written, last, by, lines):
+                if not is_row_undamaged(written, last, by, lines):
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
                 if process in (None, by):
@@ -315,14 +315,14 @@ class Store:
 
     def keep_words(self, words: Mapping[str, int]) -> None:
         """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
-        rows = [with_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
+        rows = [add_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
         if rows:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
                 self._upsert(connection, NUMBERS, rows)
 
     def _check_count(self, name: str, value: int, written: int) -> int:
         """Return a stored count; raise ValueError if `written` is not the checksum of it."""
-        if not is_whole(written, name, value):
+        if not is_row_undamaged(written, name, value):
             raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
         return value
 
@@ -342,7 +342,7 @@ class Store:
                 rows = select_plants(connection, list(PLANTS.c), names[i : i + AT_ONCE])
                 versions = {name: version for name, version, _, _ in rows}
                 bodies = carrier.migrate({name: body for name, _, body, _ in rows})
-                after = [with_checksum(PLANTS, name, versions[name] + 1, body) for name, body in bodies.items()]
+                after = [add_checksum(PLANTS, name, versions[name] + 1, body) for name, body in bodies.items()]
                 self._upsert(connection, PLANTS, after)
             this = IDENTITY_TABLE.c.name == IDENTITY
             connection.execute(update(IDENTITY_TABLE).where(this).values(value=json.dumps(mine)))
@@ -378,7 +378,7 @@ class Store:
 
     def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
         """Add to a stored count, which locks it until the commit; return the new value."""
-        new = self._insert(NUMBERS).values(with_checksum(NUMBERS, name, more))
+        new = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
         # A count that was there has the checksum of what it was before.

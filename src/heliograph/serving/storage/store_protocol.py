@@ -24,7 +24,7 @@ class StoredPlant(NamedTuple):
     damage: str = ""
 
 
-class Damage(NamedTuple):
+class DamagedRow(NamedTuple):
     """A row that is not as written: whether its name is, and the checksum that stands there."""
 
     named: bool
@@ -150,7 +150,7 @@ class InMemoryStore:
         """Do nothing: the store holds no resources."""
 
 
-def report_damage(plants: Mapping[str, Damage]) -> str:
+def describe_damaged_plants(plants: Mapping[str, DamagedRow]) -> str:
     """Return a sentence for users on damaged plants: their names, and whether a name itself was lost."""
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"

@@ -1,0 +1,250 @@
+"""Auxiliary residuals: noises of plant and sensor estimated from all data, with the rows of breaks and outliers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import numpy as np
+from scipy.special import ndtr
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.filter_data import check_data
+from heliograph.forecasting.forecast_result import Array, Forecast
+from heliograph.forecasting.one_step_predictions import predict_rows
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import fail, instance, scalar
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.noise import Gaussian
+
+FALSE = 0.01  # probability of any false shock, of all tests together
+EQUAL = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
+ROUNDING = 1e-12  # of a variance, below which nothing is known of a noise
+
+
+@readable
+@dataclass(frozen=True)
+class Shock:
+    """A row at which a noise is too large to be one.
+
+    Args:
+        row: its number, from 0.
+        kind: "break" of a state, or "outlier" of an output.
+        name: of the state or output.
+        residual: the auxiliary residual there, in deviations.
+        p: probability that any of all that were tested is as large, by Bonferroni, where the model is right.
+    """
+
+    row: int
+    kind: Literal["break", "outlier"]
+    name: str
+    residual: float
+    p: float
+
+
+@readable
+@dataclass(frozen=True)
+class Disturbances:
+    """Noises given all data, with the deviations that they have where the model is right; NaN where data say nothing.
+
+    Args:
+        outputs: names of the outputs, m of them.
+        states: names of the states, n of them.
+        output_noise: noise of each output given all data, without its mean (steps, m).
+        output_deviation: its standard deviation (steps, m).
+        state_noise: noise of the plant on the way to each row, without its mean (steps, n).
+        state_deviation: its standard deviation (steps, n).
+    """
+
+    outputs: tuple[str, ...]
+    states: tuple[str, ...]
+    output_noise: Array
+    output_deviation: Array
+    state_noise: Array
+    state_deviation: Array
+
+    @property
+    def output_residuals(self) -> Float[np.ndarray, "steps m"]:
+        """Auxiliary residuals of the outputs, noise / deviation (steps, m): normal of variance 1, not independent."""
+        residuals: np.ndarray = self.output_noise / self.output_deviation
+        return residuals
+
+    @property
+    def state_residuals(self) -> Float[np.ndarray, "steps n"]:
+        """Auxiliary residuals of the states, noise / deviation (steps, n): normal of variance 1, not independent."""
+        residuals: np.ndarray = self.state_noise / self.state_deviation
+        return residuals
+
+    def shocks(self, false: float = FALSE) -> list[Shock]:
+        """List the breaks of states and the outliers of outputs in the order of their rows.
+
+        Every residual is a test. One that is too large makes its neighbours large too, a break those of outputs and
+        an outlier those of states: of rows side by side, that whose residual is largest stands for all.
+
+        Args:
+            false: probability of any shock where the model is right; 0.01 by default.
+
+        Raises:
+            ValueError: what is no probability.
+        """
+        level = float(scalar("false", false, 0, 1))
+        residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
+        size = np.nan_to_num(np.abs(residuals))
+        p = np.minimum(2 * np.isfinite(residuals).sum() * ndtr(-size), 1.0)
+        rows = _find_peaks(size.max(axis=1), p.min(axis=1) < level)
+        return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
+
+    def _make_shock(self, row: int, residuals: np.ndarray, p: np.ndarray, place: int) -> Shock:
+        """Return the shock of a row: the residual number `place` of its residuals, with its probability."""
+        kind: Literal["break", "outlier"] = "outlier" if place < len(self.outputs) else "break"
+        return Shock(
+            row=row,
+            kind=kind,
+            name=(*self.outputs, *self.states)[place],
+            residual=float(residuals[place]),
+            p=float(p[place]),
+        )
+
+
+def disturbances(
+    filter: AbstractFilter,
+    z: Float[ArrayLike, "steps received"],
+    u: Float[ArrayLike, "steps inputs"] | None = None,
+) -> Disturbances:
+    """Estimate the noises of plant and sensor at every row given all data, and how large they should be.
+
+    Args:
+        filter: a Kalman filter of a linear plant and sensor that do not vary, with Gaussian noises, whose channel hands
+            on what is measured.
+        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+
+    Raises:
+        ValueError: another filter, data of another size, no rows.
+
+    Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), Sections 2.12 and 4.5.
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    plant, sensor = _require_linear_model(filter)
+    rows, inputs = check_data(filter, z, u)
+    predicted = predict_rows(filter, rows, inputs)
+    if not _is_received_unchanged(predicted):
+        raise fail("disturbances", "a filter whose channel hands on what is measured", "one with gains or noise")
+    # Both noises given all data, from the innovations e of the filter's predictions. The filter predicts what arrives,
+    # which here is what is measured.
+    C, R = np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
+    A, Q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)  # type: ignore[union-attr]  # a Gaussian's
+    assert predicted.received is not None
+    e = np.asarray(rows) - predicted.received.mean
+    of_outputs, of_plant = _smooth_noises(A, C, Q, R, e, predicted.states.covariance)
+    output_noise, output_deviation = _compute_deviations(*of_outputs)
+    state_noise, state_deviation = _compute_deviations(*of_plant)
+    return Disturbances(
+        outputs=tuple(predicted.received.names),
+        states=tuple(filter.states),
+        output_noise=output_noise,
+        output_deviation=output_deviation,
+        state_noise=state_noise,
+        state_deviation=state_deviation,
+    )
+
+
+def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSensor]:
+    """Return plant and sensor of a filter for a linear Gaussian model that does not vary.
+
+    Raises:
+        ValueError: another filter.
+    """
+    premise = filter.premise
+    plant, sensor = (None, None) if premise is None else (premise.plant, premise.sensor)
+    # A model that does not vary has arrays for matrices.
+    if (
+        filter.claim == "exact"
+        and isinstance(plant, LinearPlant)
+        and isinstance(sensor, LinearSensor)
+        and all(isinstance(part, np.ndarray | jax.Array) for part in (plant.matrix, sensor.matrix))
+        and all(isinstance(noise, Gaussian) for noise in (plant.noise, sensor.noise))
+        and not (plant.circular or sensor.circular)
+    ):
+        return plant, sensor
+    expected = "a Kalman filter, exact for a linear plant and sensor that do not vary, with Gaussian noises"
+    raise fail("disturbances", expected, f"{type(filter).__name__}, {filter.claim}")
+
+
+def _is_received_unchanged(predicted: Forecast) -> bool:
+    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged."""
+    sent, came = predicted.outputs, predicted.received
+    return (
+        sent is not None
+        and came is not None
+        and sent.mean.shape == came.mean.shape
+        and np.allclose(sent.covariance, came.covariance, rtol=EQUAL, atol=0)
+        and np.allclose(sent.mean, came.mean, rtol=EQUAL, atol=1e-300)
+    )
+
+
+def _smooth_noises(
+    A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, e: np.ndarray, P: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Return the means of the outputs' noise and of the plant's given all data, and the covariances of these means.
+
+    The covariances tell how far a mean strays from 0 where the model is right, not how well the noise is known: each is
+    the noise's covariance less that of the noise given the data. Shapes: means (steps, size), covariances
+    (steps, size, size).
+
+    Backward over the rows with r and N = Cov r, which hold what all later rows tell. At each row, with
+    S = C P C' + R and K = P C' S^-1:
+
+    - the outputs' noise has the mean R (S^-1 e - K' r) and the covariance R (S^-1 + K' N K) R;
+    - r <- C' S^-1 e + (I - K C)' r takes this row in;
+    - the plant's noise on the way to the row has the mean Q r and the covariance Q N Q;
+    - r <- A' r leads to the row before.
+
+    Rows of C that did not arrive are left out. Rows before the first at which all of an unknown start had been heard
+    stay NaN.
+
+    Args:
+        A: transition (n, n).
+        C: matrix of the sensor (m, n).
+        Q: covariance of the plant's noise (n, n).
+        R: covariance of the sensor's noise (m, m).
+        e: innovations (steps, m), NaN where nothing arrived.
+        P: predicted covariances (steps, n, n).
+    """
+    steps, m = e.shape
+    n = len(A)
+    output_mean, output_covariance = np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)
+    plant_mean, plant_covariance = np.full((steps, n), np.nan), np.full((steps, n, n), np.nan)
+    is_known = np.isfinite(P).all(axis=(1, 2))  # an unknown start has infinite variances
+    first_known = int(np.argmax(is_known)) if is_known.any() else steps
+    r, N = np.zeros(n), np.zeros((n, n))
+    for k in reversed(range(first_known, steps)):
+        arrived = np.flatnonzero(~np.isnan(e[k]))
+        C_k, R_k = C[arrived], R[np.ix_(arrived, arrived)]
+        S = C_k @ P[k] @ C_k.T + R_k
+        weighed, K = np.linalg.solve(S, e[k, arrived]), np.linalg.solve(S, C_k @ P[k]).T  # S^-1 e and K
+        output_mean[k, arrived] = R_k @ (weighed - K.T @ r)
+        output_covariance[k][np.ix_(arrived, arrived)] = R_k @ (np.linalg.inv(S) + K.T @ N @ K) @ R_k
+        B = np.eye(n) - K @ C_k
+        r, N = C_k.T @ weighed + B.T @ r, C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
+        plant_mean[k], plant_covariance[k] = Q @ r, Q @ N @ Q
+        r, N = A.T @ r, A.T @ N @ A
+    return (output_mean, output_covariance), (plant_mean, plant_covariance)
+
+
+def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
+
+    `covariance`: (steps, size, size).
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    known = variance > ROUNDING * np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
+    return np.where(known, mean, np.nan), np.sqrt(np.where(known, variance, np.nan))
+
+
+def _find_peaks(size: np.ndarray, marked: np.ndarray) -> list[int]:
+    """Return the rows at which the size is largest, one of each stretch of `marked` rows side by side."""
+    rows = np.flatnonzero(marked)
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+    return [int(run[np.argmax(size[run])]) for run in runs]

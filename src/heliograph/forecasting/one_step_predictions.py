@@ -1,0 +1,124 @@
+"""One step ahead at every row: what a filter, or each filter of a record, predicted of it from the rows before."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compute_once
+from heliograph.filters.base import AbstractFilter, FilterAngles
+from heliograph.filters.filter_data import check_data
+from heliograph.forecasting.backtest import list_single_filters, select_measurements
+from heliograph.forecasting.forecast import Forecasts, list_targets
+from heliograph.forecasting.forecast_result import Forecast
+from heliograph.forecasting.multistep_prediction import (
+    MultistepPredictor,
+    find_output_claim,
+    make_multistep_predictor,
+    make_prediction,
+)
+from heliograph.forecasting.start_states import find_origin
+from heliograph.model.over_time import first
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.arguments import read_plant_inputs
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import name_values
+from heliograph.simulation.results.record import Record
+
+
+def predict_rows(
+    filter: AbstractFilter,
+    z: Float[ArrayLike, "steps received"],
+    u: Float[ArrayLike, "steps inputs"] | None = None,
+) -> Forecast:
+    """Predict each row given those before it: states, outputs and what arrives, at rows where nothing arrived too.
+
+    Args:
+        filter: a filter.
+        z: measurements (steps, received), or (steps,) of one number; NaN for what did not arrive.
+        u: inputs (steps, inputs), the one that led to each row; by default a filter without inputs is assumed.
+
+    Returns:
+        A forecast one step ahead whose horizons are the rows: `received.mean[k]` is E[z_k | z_0 ... z_(k-1)].
+
+    Raises:
+        ValueError: data of another size than the filter's, no rows.
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    rows, inputs = check_data(filter, z, u)
+    if not len(rows):
+        raise fail("measurements", "at least one row", "none")
+    outlook = make_multistep_predictor(filter)
+    sensor = first(outlook.sensor)
+    names = name_values(() if sensor is None else tuple(sensor.outputs), filter.received)
+    return _make_forecast(outlook, np.asarray(rows), np.asarray(inputs), names)
+
+
+def predict_record(record: Record, inputs: Float[ArrayLike, "steps inputs"] | None = None) -> Forecasts:
+    """Predict each row of a recording given those before it, by each filter that ran over it.
+
+    What a fusion of estimates would predict is not here: it has no state of its own that is predicted.
+
+    Args:
+        record: what `hg.run` returned.
+        inputs: (steps, inputs), as they were given to `hg.run`; by default a plant without inputs is assumed.
+
+    Returns:
+        By node and filter a forecast one step ahead whose horizons are the rows, at their times; `write_estimates`
+        makes columns of it.
+
+    Raises:
+        ValueError: a record of a file or a simulation, which does not know its filters; inputs of another shape.
+
+    Source: the prediction step of the filter.
+    """
+    network = find_origin(instance("record", record, Record, "a Record")).model
+    assert isinstance(network, Network)  # nothing else makes a record with an origin
+    u, filtered = read_plant_inputs(network, inputs, len(record.time)), list_single_filters(network)
+    found: Forecasts = {}
+    for target in list_targets(find_origin(record)):
+        if (target.node, target.filter) in filtered:
+            predicted = _make_forecast(target.outlook, select_measurements(target, record), u, target.received)
+            found.setdefault(target.node, {})[target.filter] = replace(predicted, time=record.time)
+    return found
+
+
+def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, names: tuple[str, ...]) -> Forecast:
+    """Return the forecast of each row from those before it; z: measurements, u: inputs (rows, ...).
+
+    `names`: of the numbers that arrive.
+    """
+    filter, sensor = outlook.filter, first(outlook.sensor)
+    states, outputs, received = compute_once(_predict_each_row, _by_xla, (outlook, z, u))
+    angles = filter.angles_used() or FilterAngles((), ())
+    measured = outputs and make_prediction(
+        outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
+    )
+    arriving = received and make_prediction(received, names, filter.claim, angles.received)
+    return Forecast(
+        steps=np.ones(len(z), int),
+        time=np.arange(float(len(z))),
+        states=make_prediction(states, filter.states, filter.claim, angles.states),
+        outputs=measured,
+        received=arriving,
+        inputs="given" if filter.inputs else "none",
+    )
+
+
+def _predict_each_row(outlook: MultistepPredictor, z: jax.Array, u: jax.Array) -> PyTree:
+    """Return the moments that a filter predicts for each row of a recording from those before it, (rows, K, ...)."""
+
+    def predict_and_correct(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
+        """Return the state after a row, and the moments that were predicted for it."""
+        k, z_k, u_k = row
+        prior, moments = outlook.predict_step(state, u_k, k)
+        return outlook.filter.correct(prior, z_k, k)[0], moments
+
+    start = jax.tree.map(jnp.asarray, outlook.filter.init())
+    return jax.lax.scan(predict_and_correct, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+
+
+_by_xla = quickly_compiled(_predict_each_row)

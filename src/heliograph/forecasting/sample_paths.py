@@ -1,0 +1,238 @@
+"""Sample paths of the future: drawn from the last estimate of one filter, through the plant with its noises."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
+from heliograph.forecasting.forecast import ForecastTarget, check_steps_covered, find_target
+from heliograph.forecasting.horizons import Horizons, Inputs, check_inputs_ahead, find_rows_ahead
+from heliograph.forecasting.start_states import find_origin
+from heliograph.model.forecast_origin import HasOrigin
+from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transition_over
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import wrap_angles
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.float64 import compile_in_float64
+from heliograph.numerics.manifold import Manifold
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, Bool
+from heliograph.random_affine.memories_of_channels import memories
+
+DRAWS = 10_000
+
+
+@readable
+class Paths(NamedTuple):
+    """Possible futures of one filter's plant, all equally likely given what has arrived.
+
+    Args:
+        steps: how far each time is: in steps, or in the unit of time where the plant has an input dt.
+        time: of each, on the clock of the data.
+        states: names of the states.
+        outputs: names of the sensor's outputs, none of a filter that does not say which sensor it is for.
+        x: states (draws, times, n).
+        y: what the sensor would measure (draws, times, m).
+    """
+
+    steps: np.ndarray
+    time: np.ndarray
+    states: tuple[str, ...]
+    outputs: tuple[str, ...]
+    x: np.ndarray
+    y: np.ndarray
+
+    def is_beyond(self, name: str, level: float, above: bool = True) -> Bool[np.ndarray, "draws times"]:
+        """Return whether a state or an output is beyond a level, at each time of each path (draws, times).
+
+        Args:
+            name: of the state or output.
+            level: the level.
+            above: whether beyond is above the level (default) or below it.
+
+        Raises:
+            ValueError: no such state or output, a level that is no number.
+        """
+        limit = float(scalar("level", level))
+        if name in self.states:
+            values = self.x[:, :, self.states.index(name)]
+        elif name in self.outputs:
+            values = self.y[:, :, self.outputs.index(name)]
+        else:
+            known = dict.fromkeys(self.states + self.outputs)
+            raise fail("threshold", f"a state or output: {', '.join(known)}", repr(name))
+        return np.asarray(values > limit if above else values < limit)
+
+
+def draw_paths(
+    source: HasOrigin,
+    horizons: Horizons,
+    inputs: Inputs = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+    node: str | None = None,
+    filter: str | None = None,
+) -> Paths:
+    """Draw paths of states and outputs: the last state from its estimate, then the plant with its noises.
+
+    Where plant or sensor have modes, the present mode is drawn from its probabilities, and moves by its chain along the
+    path: what a filter merges when it predicts, as `gpb1_filter` does with all modes, is not merged here.
+
+    Args:
+        source: what one can forecast from, as `hg.forecast` takes it.
+        horizons: a number of steps, or a list of how far ahead, as of `hg.forecast`.
+        inputs: what the plant will get, as of `hg.forecast`; none by default.
+        draws: number of paths; 10,000 by default.
+        seed: of the random numbers; 0 by default.
+        node: whose filter, "fused" for a fused estimate; by default the only one.
+        filter: name of the filter; by default the only one.
+
+    Returns:
+        The paths: states (draws, times, n) and outputs (draws, times, m) at the horizons.
+
+    Raises:
+        ValueError: what `hg.forecast` refuses; several filters and no name; a filter that does not say what its plant
+            is, or that claims no covariance; modes of plant or sensor of which it has no probabilities; an unknown
+            start (`hg.diffuse`) of which not all has been heard.
+    """
+    origin = find_origin(source)
+    target = find_target(origin, node, filter)
+    ahead = find_rows_ahead(origin, target.outlook.filter.inputs, horizons, inputs)
+    check_steps_covered(target.outlook.filter, origin.step, len(ahead.u))
+    check_inputs_ahead(target.outlook.filter.inputs, ahead, target.outlook.filter, origin.step)
+    plant, sensor = target.outlook.plant, target.outlook.sensor
+    if plant is None:
+        raise fail("paths", "a filter that says what its plant is", type(target.outlook.filter).__name__)
+    count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
+    # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
+    starts = _draw_initial_states(target, count, np.random.default_rng(seed))
+    keys, step = jax.random.split(key, count), np.asarray(origin.step)
+    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
+    return Paths(
+        steps=ahead.steps,
+        time=ahead.time,
+        states=target.outlook.filter.states,
+        outputs=() if sensor is None else tuple(first(sensor).outputs),
+        x=np.asarray(x)[:, ahead.rows],
+        y=np.asarray(y)[:, ahead.rows],
+    )
+
+
+class ModeSwitching(NamedTuple):
+    """How a path's mode moves: by the filter's chain, from the first step on if the chain has `moved` before."""
+
+    filter: MultipleModelFilter
+    moved: Bool[Array, ""]
+
+    def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
+        """Return the mode of step k, drawn by the chain from that of the step before, or that one itself.
+
+        It stays at the first of all steps unless the chain has `moved` before. `u`: inputs of the step.
+        """
+        plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
+        rows = transition_over(plant, u, jnp.asarray(channel.transition))
+        stays = is_first & ~jnp.asarray(self.moved)
+        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(rows[mode])))
+
+    def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
+        """Return plant and sensor of one step as they are in a joint mode."""
+        plant_mode, sensor_mode = (jnp.asarray(x)[mode] for x in (self.filter.plant_modes, self.filter.sensor_modes))
+        return (
+            plant.given(plant_mode) if isinstance(plant, ModalPlant) else plant,
+            sensor.given(sensor_mode) if isinstance(sensor, ModalSensor) else sensor,
+        )
+
+
+def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
+    """Return how the modes of plant and sensor move; None where these have none."""
+    filter, plant, sensor = target.outlook.filter, target.outlook.plant, target.outlook.sensor
+    if not memories((plant, sensor)):
+        return None
+    if not isinstance(filter, MultipleModelFilter):
+        expected = "a filter that has the modes' probabilities (imm_filter, gpb1_filter, gpb2_filter)"
+        raise fail("paths of a plant or sensor with modes", expected, type(filter).__name__)
+    return ModeSwitching(filter, target.state.moved)
+
+
+def _draw_initial_states(
+    target: ForecastTarget, draws: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
+
+    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none.
+
+    Raises:
+        ValueError: a filter that claims no covariance, a state of which not all is known.
+    """
+    filter = target.outlook.filter
+    if filter.claim == "none":
+        raise fail("paths", "a filter that claims a covariance", f"{type(filter).__name__}, which claims none")
+    weights, means, covariances = (np.asarray(part) for part in target.outlook.moments(target.state))
+    if not np.isfinite(covariances).all():
+        raise fail("paths", "a state that is known", "one of which not all has been heard yet (hg.diffuse)")
+    part = generator.choice(len(weights), size=draws, p=weights / weights.sum())
+    # A mode by its probability in the drawn part: the first whose cumulated probability is above a uniform number.
+    modes: np.ndarray = np.zeros(draws, dtype=int)
+    if isinstance(target.state, ModalBeliefs):
+        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
+        uniform = generator.random(draws)[:, None] * cumulated[:, -1:]  # weights of a part need not sum to 1
+        modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
+    # The state: the part's mean, plus a root of its covariance times standard normal numbers. Attitudes are turned.
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
+    drawn: np.ndarray = Manifold((), filter.attitude).settle(means[part], means[part] + changes)
+    return drawn, modes
+
+
+@compile_in_float64
+def _draw_paths_from_states(
+    plant: AnyPlant,
+    sensor: AnySensor | None,
+    starts: tuple[Array, Array],
+    u: Array,
+    keys: jax.Array,
+    step: Array,
+    switching: ModeSwitching | None,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.
+
+    Args:
+        plant: of the paths.
+        sensor: what measures them; None for none.
+        starts: state (draws, n) and mode (draws,) before the first row.
+        u: inputs (rows, inputs).
+        keys: a random key for each path (draws,).
+        step: number of the first row.
+        switching: how modes move; None where there are none.
+    """
+
+    def move(before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[Any, Any]:
+        """Return state and mode after row k, and state and output there."""
+        (x, mode), (u_k, k) = before, row
+        key_of_row = jax.random.fold_in(key, k)
+        key_of_plant, key_of_sensor = jax.random.split(key_of_row)
+        plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
+        if switching is not None:
+            key_of_mode = jax.random.fold_in(key_of_row, 2)  # 0 and 1 may be the keys of plant and sensor
+            mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))
+            plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
+        x = plant_k.plus(plant_k.transition(x, u_k), plant_k.sample_noise(key_of_plant, u_k))
+        if sensor_k is None:
+            return (x, mode), (x, jnp.zeros(0))
+        sensor_k = sensor_k.under(plant_k.inputs, u_k)
+        y = wrap_angles(sensor_k.measure(x) + sensor_k.noise.sample(key_of_sensor), sensor_k.angles)
+        return (x, mode), (x, y)
+
+    def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the states (rows, n) and outputs (rows, m) of one path."""
+        rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
+        path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: move(before, row, key), start, rows)[1]
+        return path
+
+    paths: tuple[jax.Array, jax.Array] = jax.vmap(draw_path)(jax.tree.map(jnp.asarray, starts), keys)
+    return paths

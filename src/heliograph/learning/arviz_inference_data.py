@@ -1,0 +1,99 @@
+"""A fit as ArviZ reads it: draws of the free numbers by their Laplace approximation, and the likelihood of each row."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliograph.learning.estimate_table import Solution
+from heliograph.learning.long_run_covariance import Method
+from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.process.optional_packages import check_installed
+
+if TYPE_CHECKING:  # an extra
+    import xarray as xr
+
+BLOCK = 64  # draws whose rows are computed side by side
+METHOD: Method = "hessian"  # the curvature of the likelihood alone
+
+
+def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
+    """Return draws of the free numbers, and the log-likelihood of each row at each of them, as ArviZ keeps them.
+
+    The draws are normal on the line, about the maximum, with the covariance of the likelihood's curvature there (the
+    Laplace approximation).
+
+    Args:
+        solution: the maximum.
+        draws: how many, 2 at least.
+        seed: of the draws.
+
+    Returns:
+        An `arviz.InferenceData`, or an `xarray.DataTree` from ArviZ 1.0 on, with the groups posterior, log_likelihood
+        and sample_stats (the sums lp).
+
+    Raises:
+        ValueError: numbers at an end of their domain, or which the data do not identify; fewer than two draws.
+        ModuleNotFoundError: without ArviZ (extra "arviz").
+    """
+    check_count("draws", draws, 2)
+    random = np.random.default_rng(check_seed("seed", seed))
+    check_installed(["arviz", "xarray"])
+    without_normal_law = [row.name for row in solution.rows(METHOD) if row.boundary or not row.identified]
+    if without_normal_law:
+        expected = "numbers inside their domains that the data identify"
+        raise fail("fit, to_arviz", expected, ", ".join(without_normal_law))
+    covariance, _ = solution.covariance(METHOD)
+    points = solution.x + random.multivariate_normal(np.zeros(len(solution.x)), covariance, draws, method="cholesky")
+    density = np.concatenate(
+        [_evaluate_row_likelihoods(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)]
+    )
+    groups = {
+        "posterior": _make_posterior(solution, points),
+        "log_likelihood": _select_arrived_rows(solution, density),
+        "sample_stats": _make_total_likelihood_dataset(density),
+    }
+    arviz = import_module("arviz")
+    if hasattr(arviz, "InferenceData"):
+        return arviz.InferenceData(**groups)
+    return import_module("xarray").DataTree.from_dict(groups)  # from version 1.0 on
+
+
+def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndarray:
+    """Return log p of each row given those before it at points of the line, (points, rows), the recordings in a row."""
+    density = np.asarray(solution.surface.evaluate_rows(points).density)
+    return np.concatenate([density[:, i, :steps] for i, steps in enumerate(solution.surface.data.lengths)], axis=1)
+
+
+def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
+    """Return the free numbers of the table by name at points of the line (draws, p), as a dataset."""
+    values = np.stack([solution.parameters.entries_at(x) for x in points])
+    names = [entry.name for entry in solution.parameters.entries]
+    return _make_dataset({name: (("chain", "draw"), values[None, :, i]) for i, name in enumerate(names)})
+
+
+def _select_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
+    """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each."""
+    data = solution.surface.data
+    rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]
+    arrived = np.array([bool(np.isfinite(data.measurements[i, k]).any()) for i, k in rows])
+    recording, row = np.array(rows)[arrived].T
+    content = {"rows": (("chain", "draw", "arrival"), density[None][:, :, arrived])}
+    return _make_dataset(content, {"recording": ("arrival", recording), "row": ("arrival", row)})
+
+
+def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
+    """Return the log-likelihood of all rows at each draw, as a dataset, from log p (draws, rows) of each row."""
+    return _make_dataset({"lp": (("chain", "draw"), density.sum(axis=1)[None])})
+
+
+def _make_dataset(content: dict[str, Any], more: dict[str, Any] | None = None) -> "xr.Dataset":
+    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}, with one chain numbered 0.
+
+    `more`: further coordinates.
+    """
+
+    import xarray as xr
+
+    draws = next(iter(content.values()))[1].shape[1]
+    return xr.Dataset(content, {"chain": [0], "draw": np.arange(draws), **(more or {})})

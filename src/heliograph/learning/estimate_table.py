@@ -1,0 +1,400 @@
+"""Table of estimates with intervals: of the maximum of one form of the likelihood, and what is at a limit or a ridge.
+
+The line: free numbers as unbounded coordinates, logarithms or logits of those whose domain has ends. A coordinate is
+active if its number is not at such an end. A ridge is a direction in which the likelihood does not change.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.learning.free_parameters import Parameters, TableEntry
+from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
+from heliograph.learning.likelihood.objective import Form
+from heliograph.learning.likelihood.parameter_transforms import from_line, slope_from_line, to_line
+from heliograph.learning.likelihood.surface import LikelihoodSurface
+from heliograph.learning.long_run_covariance import (
+    DRAWS,
+    LEVEL,
+    Method,
+    Scores,
+    bootstrap_block_sums,
+    compute_sandwich_covariance,
+    estimate_long_run_covariance,
+    find_numbers_told_by_few_stretches,
+    find_profile_drop,
+    remove_predicted_scores,
+    student_quantile,
+)
+from heliograph.learning.unidentified_directions import InformationRank, find_information_rank
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Bool, Float
+
+WIDE = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
+END = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
+REAL_END = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
+ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
+
+
+@readable
+class Row(NamedTuple):
+    """Row of the table of a fit: a free number by one form of the likelihood.
+
+    Args:
+        name: the number's name.
+        estimate: the estimate.
+        low: lower end of the interval (95 % unless another level is given); NaN if not identified.
+        high: upper end.
+        standard_error: standard error of the estimate; NaN at a boundary or if not identified.
+        form: "linear" or "conditional".
+        boundary: true if the estimate is the end of the number's domain; the interval is from there to the other end.
+        identified: true if the data identify this number without knowledge of the others.
+    """
+
+    name: str
+    estimate: float
+    low: float
+    high: float
+    standard_error: float
+    form: Form
+    boundary: bool
+    identified: bool
+
+    @property
+    def interval(self) -> str:
+        """Interval in words, with two digits of its own width: "0.12 to 0.31", "below 0.3", "not identified"."""
+        if not self.identified:
+            return "not identified"
+        low, high = (round_to_width(end, self.high - self.low) for end in (self.low, self.high))
+        if self.boundary:
+            return f"below {high}" if self.high > self.estimate else f"above {low}"
+        return f"{low} to {high}"
+
+    @property
+    def value(self) -> str:
+        """Estimate in words, with two digits of the interval's width."""
+        return round_to_width(self.estimate, self.high - self.low)
+
+
+def round_to_width(value: float, width: float) -> str:
+    """Return a number to two digits of a width, at most eight of its own; to four of its own where there is no width.
+
+    An end that is far smaller than the width keeps two digits of its own.
+    """
+    if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
+        return f"{value:.4g}"
+    digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(width))) + 2
+    return f"{value:.{min(max(digits, 2), 8)}g}"
+
+
+@dataclass(frozen=True, repr=False)
+class Solution:
+    """Maximum of the likelihood in one form.
+
+    Args:
+        surface: the likelihood.
+        top: where the search ended.
+        ridges: number of directions in which the likelihood does not change.
+    """
+
+    surface: LikelihoodSurface
+    top: HighestPoint
+    ridges: int
+    _tables: dict[tuple[Method, float], tuple[Row, ...]] = field(default_factory=dict, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """Return form, log-likelihood, whether this is a maximum, and the numbers; no data."""
+        numbers = dict(zip([entry.name for entry in self.parameters.entries],
+                           self.parameters.entries_at(self.x).tolist(), strict=True))  # fmt: skip
+        state = "converged" if self.converged else "not converged"
+        values = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        return f"Solution({self.form}: log-likelihood {self.total:.6g}, {state}; {values})"
+
+    @property
+    def x(self) -> Float[np.ndarray, " p"]:
+        """The maximum on the line (p,); infinite where a number is at the end of its domain."""
+        return self.top.limit
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood there, in nats."""
+        return self.top.total
+
+    @property
+    def active(self) -> Bool[np.ndarray, " p"]:
+        """Return which coordinates are not at a boundary (p,)."""
+        return self.top.active
+
+    @property
+    def converged(self) -> bool:
+        """True if the search came to a maximum."""
+        return self.top.converged
+
+    @property
+    def steps(self) -> int:
+        """Count of steps of the last climb to the maximum."""
+        return self.top.steps
+
+    @property
+    def form(self) -> Form:
+        """Name of the form of likelihood that was maximised."""
+        return self.surface.objective.form
+
+    @property
+    def parameters(self) -> Parameters:
+        """Free numbers of the model that was fitted."""
+        return self.surface.objective.description.parameters
+
+    @cached_property
+    def scores(self) -> Scores:
+        """Scores of each step, by recording, among active coordinates."""
+        score = self.surface.evaluate_rows(self.top.x[None]).score[0][..., self.active]
+        return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
+
+    @cached_property
+    def rank(self) -> InformationRank:
+        """Flat directions at the maximum, among active coordinates, as many as the ridges."""
+        return find_rank_of_late_rows(
+            self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
+        )
+
+    @cached_property
+    def hessian(self) -> Float[np.ndarray, "r r"]:
+        """Hessian of -l along the r identified directions (`basis`); the information where it is not positive."""
+        observed = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
+        reduced = self._project_on_identified(observed)
+        least_eigenvalue = np.linalg.eigvalsh(reduced)[:1].sum()  # 0 where there is no direction
+        if least_eigenvalue > 0:
+            return reduced
+        information = self.surface.evaluations(self.top.x[None]).information[0]
+        return self._project_on_identified(information[np.ix_(self.active, self.active)])
+
+    @property
+    def basis(self) -> Float[np.ndarray, "active r"]:
+        """Identified directions, in columns."""
+        return np.asarray(self.rank.unit[:, None] * self.rank.rest)
+
+    def _project_on_identified(self, matrix: np.ndarray) -> np.ndarray:
+        """Return a matrix of the active coordinates along the identified directions, B' A B."""
+        return np.asarray(self.basis.T @ matrix @ self.basis)
+
+    @cached_property
+    def few(self) -> Bool[np.ndarray, " active"]:
+        """Which active coordinates are real numbers told by a few stretches of the data, as a step is (active,)."""
+        places = np.flatnonzero(self.active & self.surface.domains.free)
+        few = np.zeros(len(self.active), dtype=bool)
+        if len(places) and not self.rank.flat.size:
+            few[places] = find_numbers_told_by_few_stretches(self.surface.information_by_row(self.top.x, places))
+        return np.asarray(few[self.active])
+
+    def covariance(self, method: Method = "cosines") -> tuple[Float[np.ndarray, "active active"], float]:
+        """Return the covariance of the active coordinates, along the identified directions, and its degrees of freedom.
+
+        It is H^-1 J H^-1 with the Hessian H of -l and J the covariance of the sum of scores, estimated by `method`. Of
+        numbers that a few stretches of the data tell, J is what the model says.
+        """
+        scores, by_model = self.scores, np.zeros((len(self.few), len(self.few)))
+        if self.few.any():
+            # The Hessian of all active coordinates from that along the directions, which are as many.
+            inverse = np.linalg.inv(self.basis)
+            scores, by_model = remove_predicted_scores(scores, inverse.T @ self.hessian @ inverse, self.few)
+        estimate = estimate_long_run_covariance(method, [s @ self.basis for s in scores], self.hessian)
+        if method != "hessian":
+            estimate = estimate._replace(covariance=estimate.covariance + self._project_on_identified(by_model))
+        sandwich = compute_sandwich_covariance(self.hessian, estimate.covariance)
+        return np.asarray(self.basis @ sandwich @ self.basis.T), estimate.freedom
+
+    def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
+        """Return the table of estimates by this form with intervals by a method, computed at the first call."""
+        key = method, level
+        if key not in self._tables:
+            self._tables[key] = self._make_rows(method, level)
+        return self._tables[key]
+
+    @property
+    def has_rows(self) -> bool:
+        """True if the default table was computed."""
+        return ("cosines", LEVEL) in self._tables
+
+    def describe_with_cheap_errors(self) -> list[str]:
+        """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
+        active, values = self.active, self.parameters.entries_at(self.x)
+        # Variances g' I^-1 g, with the derivatives g of each number by the active coordinates, on the line.
+        information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
+        inverse = np.linalg.pinv(information, hermitian=True)
+        slopes = self.parameters.slopes(self.top.x)[:, active]
+        errors = np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", slopes, inverse, slopes), 0.0))
+        width = max(len(entry.name) for entry in self.parameters.entries)
+        return [
+            f"{entry.name:{width}}  {self._describe_entry(entry, float(value), slope, float(error))}  ({self.form})"
+            for entry, value, slope, error in zip(self.parameters.entries, values, slopes, errors, strict=True)
+        ]
+
+    def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
+        """Return in words an estimate `value` and its interval, symmetric on the line, by a standard error there.
+
+        `slope`: derivative of the number by the active coordinates, which tells whether it is identified.
+        """
+        if entry.coordinate is not None and not self.active[entry.coordinate]:
+            return f"{value:>10.4g}  (at the end of its domain)"
+        if not self.identifies(slope):
+            return f"{value:>10.4g}  (not identified)"
+        with np.errstate(divide="ignore"):  # of a value that rounding puts at the end of its domain
+            center = float(to_line(entry.domain, value))
+            half = student_quantile(np.inf) * error  # of the normal law: infinitely many degrees of freedom
+            row = self._make_row(entry, value, error, (center - half, center + half))
+        return f"{row.value:>10}  (about {row.interval})"
+
+    def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
+        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`."""
+        covariance, freedom = self.covariance("hessian" if method == "profile" else method)
+        # The estimates, and their derivatives by the active coordinates, on the line.
+        values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
+        rows = []
+        for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
+            error = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+            if entry.coordinate is not None and not self.active[entry.coordinate]:
+                rows.append(self._make_boundary_row(entry, float(value), level))
+            elif not self.identifies(slope):
+                rows.append(_make_unidentified_row(entry, float(value), self.form))
+            else:
+                ends = self._compute_interval(entry, float(value), slope, error, freedom, method, level)
+                rows.append(self._make_row(entry, float(value), error, ends))
+        return tuple(rows)
+
+    def _compute_interval(
+        self,
+        entry: TableEntry,
+        value: float,
+        slopes: np.ndarray,
+        error: float,
+        freedom: float,
+        method: Method,
+        level: float,
+    ) -> tuple[float, float]:
+        """Return the ends of the interval of a number of the table, on the line, where its domain is symmetric.
+
+        By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
+        likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
+        interval: it is cut out of the profile whatever the method.
+
+        Args:
+            entry: the number.
+            value: its estimate.
+            slopes: its derivative, on the line, by each active coordinate (active,).
+            error: its standard error on the line.
+            freedom: degrees of freedom with which the error is known.
+            method: of `Fit.rows`.
+            level: probability with which the interval holds the number.
+        """
+        coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
+        is_told_by_few = False
+        if coordinate is not None:
+            hardly_known = self.surface.domains.single[coordinate] and error > WIDE
+            if hardly_known or method == "profile":
+                first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
+                low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
+                return low, high
+            is_told_by_few = bool(self.few[np.count_nonzero(self.active[:coordinate])])  # its place among active ones
+        center = float(to_line(entry.domain, value))
+        # Blocks drawn anew say nothing of numbers of which a few stretches of the data tell all.
+        if method == "bootstrap" and not is_told_by_few:
+            low, high = center + self._bootstrap_interval(slopes, level)
+            return low, high
+        half = student_quantile(freedom, level) * error
+        return center - half, center + half
+
+    def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
+        """Return the row of an identified number, by its standard error and both ends of its interval on the line."""
+        low, high = sorted(float(from_line(entry.domain, end)) for end in ends)
+        slope = abs(float(slope_from_line(entry.domain, to_line(entry.domain, value))))
+        return Row(
+            name=entry.name,
+            estimate=value,
+            low=low,
+            high=high,
+            standard_error=error * slope,
+            form=self.form,
+            boundary=False,
+            identified=True,
+        )
+
+    def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
+        """Return whether the data identify a function of the numbers, which it is if it does not change along ridges.
+
+        `slopes`: its derivatives by the active coordinates (active,).
+        """
+        along = self.rank.unit * slopes
+        size = np.linalg.norm(along)
+        return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
+
+    def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
+        """Return both ends of an interval, relative to the estimate, by sums of blocks of scores that are drawn anew.
+
+        `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
+        the sum.
+        """
+        drawn = np.linalg.solve(self.hessian, bootstrap_block_sums([s @ self.basis for s in self.scores], DRAWS, 0).T)
+        return np.asarray(np.quantile(slopes @ self.basis @ drawn, [(1 - level) / 2, (1 + level) / 2]))
+
+    def _make_boundary_row(self, entry: TableEntry, value: float, level: float) -> Row:
+        """Return the row of a number at an end of its domain: the interval is from there to where the profile fell.
+
+        There the square root of the fall is half of a normal variable, so that a level of 95 % is the quantile of 90 %.
+        """
+        assert entry.coordinate is not None
+        outward = self.top.ends[entry.coordinate]  # -1 or 1
+        first, drop = np.array([-outward * FURTHER]), find_profile_drop(2 * level - 1)
+        (end,) = self._find_profile_ends(entry.coordinate, first, drop)
+        limit = float(from_line(entry.domain, end if np.isfinite(end) else -outward * np.inf))
+        return Row(
+            name=entry.name,
+            estimate=value,
+            low=min(value, limit),
+            high=max(value, limit),
+            standard_error=np.nan,
+            form=self.form,
+            boundary=True,
+            identified=True,
+        )
+
+    def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
+        """Return where the profile of a coordinate has fallen by `drop` nats, one end for each of `first`.
+
+        `first`: signed distances from the maximum at which the search for each end begins.
+        """
+        furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
+        return self.surface.find_profile_crossings(
+            self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
+        )
+
+
+def _make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
+    """Return the row of a number that the data do not identify: where the search ended, without an interval."""
+    return Row(
+        name=entry.name,
+        estimate=value,
+        low=np.nan,
+        high=np.nan,
+        standard_error=np.nan,
+        form=form,
+        boundary=False,
+        identified=False,
+    )
+
+
+def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
+    """Return the rank of the information of a recording's second half (p, p), with `ridges` flat directions.
+
+    What is known before the first step pins a ridge weakly; that does not grow with the data, and is not used.
+    """
+    rank = find_information_rank(late)
+    if rank.flat.shape[1] == ridges:
+        return rank
+    # The directions of the least eigenvalues, in units of each coordinate's standard error, are the flat ones.
+    diagonal = np.diag(late)
+    unit = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
+    return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)

@@ -1,0 +1,167 @@
+"""Free numbers as unbounded coordinates, in which a fit searches, and as the entries of a user's table."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliograph.learning.likelihood.parameter_transforms import (
+    count_coordinates,
+    map_from_line,
+    map_to_line,
+    slope_from_line,
+    slope_to_line,
+)
+from heliograph.numerics.check import POSITIVE, PROBABILITY, REAL, Domain
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, Float
+
+
+@readable
+@dataclass(frozen=True)
+class Parameter:
+    """A free number, which may be an array: its name, start and domain.
+
+    Its coordinates are unbounded numbers, on which it is searched; its entries are the numbers of the table.
+    """
+
+    name: str
+    start: Float[np.ndarray, "..."]
+    domain: Domain
+
+    @property
+    def size(self) -> int:
+        """Return how many coordinates it has."""
+        return count_coordinates(self.domain, self.start.shape)
+
+    @property
+    def entry_names(self) -> tuple[str, ...]:
+        """Return the names of its entries in the table; of a covariance those on and below the diagonal."""
+        if self.start.ndim == 0:
+            return (self.name,)
+        indices = np.ndindex(self.start.shape)
+        is_covariance = self.domain.kind == "covariance"
+        shown = [index for index in indices if not is_covariance or index[0] >= index[1]]
+        return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in shown)
+
+    def list_entries(self, value: Array) -> Array:
+        """Return the entries (entries,) of the table from a value of the free number."""
+        return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
+
+    def entries_at(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
+        """Return the entries (entries,) of the table at a point x (size,) of the line."""
+        with jax.enable_x64(True):
+            return np.asarray(self._trace_entries(np.asarray(x)))
+
+    def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
+        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
+        if self.domain.kind == "interval":
+            return np.diag(slope_from_line(self.domain, x))
+        with jax.enable_x64(True):
+            return np.asarray(jax.jacfwd(self._trace_entries)(jnp.asarray(x)))
+
+    def _trace_entries(self, x: Array) -> Array:
+        """Return the entries (entries,) at coordinates x (size,), in operations that JAX can trace."""
+        return self.list_entries(map_from_line(self.domain, self.start.shape, x))
+
+    @property
+    def entry_domains(self) -> tuple[Domain, ...]:
+        """Return the domain of each of its entries in the table."""
+        if self.domain.kind == "simplex":
+            return (PROBABILITY,) * self.start.size
+        if self.domain.kind == "covariance":
+            return tuple(POSITIVE if i == j else REAL for i, j in zip(*np.tril_indices(len(self.start)), strict=True))
+        return (self.domain,) * self.start.size
+
+
+class TableEntry(NamedTuple):
+    """Number of the table: its name, its domain, and the index of its coordinate; None if it has none of its own."""
+
+    name: str
+    domain: Domain
+    coordinate: int | None
+
+
+@readable
+@dataclass(frozen=True)
+class Parameters:
+    """Free numbers of a network in the order in which it asks for them.
+
+    Args:
+        every: the numbers.
+    """
+
+    every: tuple[Parameter, ...]
+
+    @property
+    def size(self) -> int:
+        """Return how many coordinates all have together."""
+        return sum(parameter.size for parameter in self.every)
+
+    @property
+    def start(self) -> Float[np.ndarray, " p"]:
+        """Return the coordinates of all starts."""
+        return np.concatenate(
+            [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
+        )
+
+    @property
+    def entries(self) -> tuple[TableEntry, ...]:
+        """Return the numbers of the table, in order."""
+        results, begin = [], 0
+        for parameter in self.every:
+            has_own = parameter.domain.kind == "interval"  # then each entry has a coordinate of its own
+            for i, (name, domain) in enumerate(zip(parameter.entry_names, parameter.entry_domains, strict=True)):
+                results.append(TableEntry(name, domain, begin + i if has_own else None))
+            begin += parameter.size
+        return tuple(results)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of all coordinates."""
+        return tuple(
+            parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
+            for parameter in self.every
+            for i in range(parameter.size)
+        )
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Return the free numbers at a point x (p,) of the line, {name: number}, in operations that JAX traces."""
+        ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
+        return {
+            parameter.name: map_from_line(parameter.domain, parameter.start.shape, x[a:b])
+            for parameter, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
+        }
+
+    def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
+        """Return the free numbers at a point x (p,) of the line, {name: number}, as plain floats and arrays."""
+        with jax.enable_x64(True):
+            return {name: to_plain_number(value) for name, value in self.values(np.asarray(x)).items()}
+
+    def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
+        """Return the values of all entries of the table (entries,) at a point x (p,) of the line."""
+        return np.concatenate([parameter.entries_at(single) for parameter, single in self._split_point(x)])
+
+    def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
+        """Return the derivatives of all entries of the table by the coordinates x (entries, p)."""
+        blocks = [parameter.differentiate_entries(own) for parameter, own in self._split_point(x)]
+        return np.asarray(block_diag(*blocks))  # an entry depends on the coordinates of its own number alone
+
+    def _split_point(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
+        """Return each free number with its own coordinates (size,) at a point x (p,)."""
+        ends = np.cumsum([parameter.size for parameter in self.every])
+        return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
+
+    def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
+        """Return the derivatives (entries, p) of the entries, mapped to the line by `link`, by the coordinates x."""
+        pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
+        with np.errstate(all="ignore"):
+            return np.stack([slope_to_line(entry.domain, value) * row for entry, value, row in pairs])
+
+
+def to_plain_number(value: Array) -> float | np.ndarray:
+    """Return a single number as a float, several as an array."""
+    return float(value) if np.ndim(value) == 0 else np.asarray(value)

@@ -1,0 +1,111 @@
+"""Fits compared and tested: information criteria, likelihood-ratio and Wald tests."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+from typing_extensions import TypeAliasType
+
+from heliograph.numerics.check import check_count, fail, scalar, table
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+
+ROUNDING = 1e-6  # nats by which the likelihood of a larger model may be lower, as its search ended so near
+
+Values = TypeAliasType("Values", Mapping[str, Float[ArrayLike, ""]])
+
+
+@readable
+class FitTest(NamedTuple):
+    """Test of a statement about free numbers, by a statistic that has a chi-square law where it is true.
+
+    Args:
+        statistic: the statistic.
+        freedom: degrees of freedom: how many numbers the statement fixes.
+        p_value: probability of a statistic as large where the statement is true.
+    """
+
+    statistic: float
+    freedom: int
+    p_value: float
+
+
+def chi_square_test(statistic: float, freedom: int) -> FitTest:
+    """Return the test by a statistic that is chi-square with so many degrees of freedom where the statement is true.
+
+    Args:
+        statistic: the statistic.
+        freedom: degrees of freedom.
+    """
+    return FitTest(float(statistic), freedom, float(chi2.sf(statistic, freedom)))
+
+
+def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
+    """Return the likelihood-ratio test of a model of fewer free numbers: 2 (l - l_0).
+
+    Args:
+        larger: log-likelihood of the model with all numbers free.
+        smaller: that with some of them fixed.
+        freedom: number of those.
+
+    Raises:
+        ValueError: no fewer numbers; a smaller model whose likelihood is larger.
+    """
+    if freedom < 1:
+        raise fail("smaller model", "one of fewer free numbers", f"{-freedom} more" if freedom else "as many")
+    if smaller > larger + ROUNDING:
+        raise fail(
+            "smaller model", f"a log-likelihood of at most {larger:.6g}, as part of the larger one", f"{smaller:.6g}"
+        )
+    return chi_square_test(2 * max(larger - smaller, 0.0), freedom)
+
+
+def wald_test(
+    estimates: Mapping[str, float], covariance: Float[np.ndarray, "entries entries"], values: Values
+) -> FitTest:
+    """Return Wald's test that some numbers have given values: d' C^-1 d, of the distance d and its covariance C.
+
+    Args:
+        estimates: by name, in the order of the covariance.
+        covariance: of the estimates.
+        values: by name.
+
+    Raises:
+        ValueError: no values, an unknown name, a number that is at a boundary or not identified.
+    """
+    asked = table("values", values, "numbers")
+    if not asked or set(asked) - set(estimates):
+        raise fail("values", f"numbers for some of {list(estimates)}", list(asked))
+    places = [list(estimates).index(name) for name in asked]
+    inner = covariance[np.ix_(places, places)]
+    if not np.isfinite(inner).all():
+        raise fail("values", "numbers that are identified and not at a boundary", list(asked))
+    distance = np.array([estimates[name] - float(scalar(f"value of {name!r}", value)) for name, value in asked.items()])
+    return chi_square_test(float(distance @ np.linalg.solve(inner, distance)), len(places))
+
+
+class InformationCriteria(NamedTuple):
+    """Criteria by which models are compared, the smaller the better: of Akaike, the same for few data, of Schwarz."""
+
+    aic: float
+    aicc: float
+    bic: float
+
+
+def compute_criteria(log_likelihood: float, free: int, observations: int) -> InformationCriteria:
+    """Return AIC, AICc and BIC; AICc is infinite where numbers are as many as data.
+
+    Args:
+        log_likelihood: at the maximum, in nats.
+        free: number of free numbers.
+        observations: number of values that arrived.
+    """
+    check_count("observations", observations)
+    aic = 2 * free - 2 * log_likelihood
+    left = observations - free - 1
+    return InformationCriteria(
+        aic=aic,
+        aicc=aic + 2 * free * (free + 1) / left if left > 0 else float("inf"),
+        bic=free * float(np.log(observations)) - 2 * log_likelihood,
+    )

@@ -1,0 +1,318 @@
+"""Identifiability of a network's free numbers, by second moments of its routes and by a recording, in words."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.learning.free_parameters import Parameters
+from heliograph.learning.likelihood.data import LikelihoodData
+from heliograph.learning.likelihood.objective import Objective, join_all_nodes, make_objectives
+from heliograph.learning.likelihood.surface import LikelihoodSurface
+from heliograph.learning.long_run_covariance import student_quantile
+from heliograph.learning.parametric_network import Build, describe
+from heliograph.learning.unidentified_directions import (
+    WEAK,
+    ConfoundedNumbers,
+    InformationRank,
+    find_confounded,
+    find_information_rank,
+    format_product,
+    format_sum,
+)
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.sensor import AbstractSensor
+from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.float64 import quickly_compiled
+from heliograph.numerics.linalg import cholesky, contract
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import second_order
+
+if TYPE_CHECKING:
+    from heliograph.learning.estimate_table import Solution
+
+POINTS = 3
+AROUND = 0.5  # how far from the start, in each coordinate
+
+
+@readable
+@dataclass(frozen=True)
+class Identifiability:
+    """Identifiability: names that the data identify alone, groups of which they identify combinations, and sentences.
+
+    Args:
+        parameters: the free numbers.
+        groups: groups of numbers that the data do not separate.
+        ridges: number of directions in which the likelihood does not change.
+        weakest: least eigenvalue of the information above zero, with each number in units of its standard error; small
+            where two numbers are hard to separate.
+        sentences: all this in words.
+    """
+
+    parameters: Parameters
+    groups: tuple[ConfoundedNumbers, ...]
+    ridges: int
+    weakest: float
+    sentences: tuple[str, ...]
+
+    @property
+    def identified(self) -> tuple[str, ...]:
+        """Coordinates that the data identify without knowledge of the others."""
+        lost = {index for group in self.groups for index in group.places}
+        return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
+
+    def at(self, solution: "Solution") -> "Identifiability":
+        """Return the identifiability with estimates and intervals of what is identified."""
+        return replace(self, sentences=describe_unidentified(self, solution))
+
+    def __str__(self) -> str:
+        """Return the sentences, a line for each."""
+        return "\n".join(self.sentences) or "All free numbers are identified."
+
+
+def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int = 400, seed: int = 0) -> Identifiability:
+    """Examine what a recording of this network could identify of its free numbers, before there is one.
+
+    Data are drawn as the filter expects them, at three points around the start, and the information that their second
+    half holds is examined: that of the first is helped by what is known of the initial state, and does not grow.
+
+    Args:
+        network: a function that returns a Network in which numbers are marked by `hg.free`.
+        inputs: inputs of the plant (horizon, inputs), which a plant with inputs needs (default none).
+        horizon: number of steps of the data, where there are no inputs; 400 by default.
+        seed: seed of the data and of the points (default 0).
+
+    Raises:
+        ValueError: as `fit`.
+    """
+    description = describe(network)
+    objective = make_objectives(description)[-1]
+    count = len(description.start.inputs)
+    if inputs is None and count:
+        raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
+    u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
+    points = _draw_points_near(description.parameters.start, seed)
+    ranks = []
+    for i, x in enumerate(points):
+        z = _draw_measurements(objective, x, u, check_seed("seed", seed) + i)
+        data = LikelihoodData(measurements=z[None], inputs=u[None], lengths=(len(z),))
+        ranks.append(find_information_rank(LikelihoodSurface(objective, data).evaluations(x[None]).late[0]))
+    return _judge_identifiability(description.parameters, points, ranks)
+
+
+def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
+    """Return what a recording identifies of the free numbers, by its information at three points around a start (p,).
+
+    Points at which that is not finite are left out.
+    """
+    points = _draw_points_near(start, seed)
+    late = surface.evaluations(np.stack(points)).late
+    sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
+    if not sound:
+        points, late, sound = [start], surface.evaluations(start[None]).late, [0]
+    ranks = [find_information_rank(late[i]) for i in sound]
+    return _judge_identifiability(surface.objective.description.parameters, [points[i] for i in sound], ranks)
+
+
+def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
+    """Return POINTS points (p,) drawn near a start (p,), within AROUND, or less of coordinates that are small."""
+    rng = np.random.default_rng([seed, 1])
+    reach = np.minimum(1.0, 0.2 + np.abs(start))
+    return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
+
+
+def _judge_identifiability(
+    parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
+) -> Identifiability:
+    """Return the identifiability by the ranks of the information at several points (p,), with its sentences."""
+    groups = tuple(find_confounded(parameters, points, ranks))
+    ridges = min(rank.flat.shape[1] for rank in ranks)
+    weakest = max(rank.weakest for rank in ranks)
+    identifiability = Identifiability(parameters, groups, ridges, weakest, ())
+    return replace(identifiability, sentences=describe_unidentified(identifiability, None))
+
+
+def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
+    """Return the sentences on numbers that are not identified, and on what is in their place.
+
+    `solution`: the maximum, whose estimates and intervals they have; None where there is none yet.
+    """
+    names = identifiability.parameters.coordinates
+    lines = [
+        _describe_confounded_group(identifiability.parameters, group, solution) for group in identifiability.groups
+    ]
+    # Where a group has more identified combinations than products, moments of the links say more.
+    has_others = any(group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups)
+    if solution is not None and has_others:
+        lines += describe_identified_links(solution)
+    if identifiability.weakest < WEAK:
+        lines.append(
+            f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
+            "expect wide intervals."
+        )
+    return tuple(lines)
+
+
+def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
+    """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
+
+    Such as "Of a and b only the product a * b (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a
+    `solution`, the maximum of the likelihood.
+    """
+    names = [parameters.coordinates[i] for i in group.places]
+    if group.fix == len(names):  # no combination of them is identified
+        return f"Nothing in the data tells {_join_names(names)}."
+    fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
+    # Products x^a y^b and sums a x + b y that are identified, each with its interval.
+    combinations = []
+    for row in group.exponents:
+        combinations.append(format_product(names, row) + _format_interval(parameters, group, row, solution, log=True))
+    for row in group.weights:
+        combinations.append(format_sum(names, row) + _format_interval(parameters, group, row, solution, log=False))
+    # Of n numbers, of which k must be fixed, n - k combinations are identified; some are neither product nor sum.
+    unnamed = len(names) - group.fix - len(combinations)
+    if not combinations:
+        return f"The data tell only {_count_in_words(unnamed, 'combination')} of {_join_names(names)}; {fix}."
+    kind = "product" if np.all(group.exponents >= 0) else "combination"  # a / b is no product
+    if len(group.weights):  # then there are no products
+        kind = "sum"
+    kind += "s" if len(combinations) > 1 else ""
+    others = f" and {_count_in_words(unnamed, 'other combination')}" if unnamed else ""
+    verb = "is" if len(combinations) == 1 and not unnamed else "are"
+    return f"Of {_join_names(names)} only the {kind} {_join_names(combinations)}{others} {verb} identified; {fix}."
+
+
+def _count_in_words(count: int, what: str) -> str:
+    """Return a count of things as text: "one combination", "3 combinations"."""
+    return f"one {what}" if count == 1 else f"{count} {what}s"
+
+
+def _format_interval(
+    parameters: Parameters, group: ConfoundedNumbers, row: np.ndarray, solution: "Solution | None", log: bool
+) -> str:
+    """Return the interval in parentheses, (0.48, 95 % 0.44..0.53), of a product or a sum at a maximum; "" if none.
+
+    Args:
+        parameters: the free numbers.
+        group: the group that it is of.
+        row: exponents of a product, or weights of a sum, by place in the group.
+        solution: the maximum; None where there is none yet.
+        log: whether it is a product, whose logarithm sum_i a_i log |v_i| is a sum.
+    """
+    if solution is None or not all(solution.active[i] for i in group.places):
+        return ""
+    jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
+    slopes, value = np.zeros(len(solution.x)), 0.0
+    for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
+        if entry.coordinate in group.places:
+            weight = row[group.places.index(entry.coordinate)]
+            slopes += weight * (slope / number if log else slope)
+            value += weight * (np.log(abs(number)) if log else number)
+    # g' C g is the variance of a function with the gradient g.
+    covariance, freedom = solution.covariance()
+    gradient = slopes[solution.active]
+    reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+    middle, low, high = ((np.exp(v) if log else v) for v in (value, value - reach, value + reach))
+    return f" ({middle:.3g}, 95 % {low:.3g}..{high:.3g})"
+
+
+def _join_names(names: list[str]) -> str:
+    """Return names with commas between them, and "and" before the last."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
+    """Return measurements (steps, received) drawn as the filter at x (p,) expects them, with inputs u.
+
+    Each row is Gaussian given those before it.
+    """
+    with jax.enable_x64(True):
+        return np.asarray(_draw_measurements_by_innovations(objective, x, u, jax.random.key(seed)))
+
+
+@quickly_compiled
+def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
+    """Return measurements (steps, received) drawn from the filter itself, each from N(E z, S) given those before."""
+    filter = objective.filter(jnp.asarray(x))
+
+    def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+        """Return the filter's state after row k, and the measurement drawn for it."""
+        k, u_k, noise = row
+        prior = filter.predict(state, u_k, k)
+        # The innovation of z = 0 is -E z, with covariance S.
+        received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
+        z = cholesky(jnp.asarray(received.covariance)) @ noise - received.value
+        return filter.correct(prior, z, k)[0], z
+
+    start = jax.tree.map(jnp.asarray, filter.init())
+    noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
+    measurements: jax.Array = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    return measurements
+
+
+if TYPE_CHECKING:
+    from heliograph.learning.estimate_table import Solution
+
+KINDS = ("mean gain", "gain variance", "noise")
+
+
+def describe_identified_links(solution: "Solution") -> list[str]:
+    """Return a sentence on each output of which the data identify mean gain, gain variance or noise.
+
+    Such as "The received y has mean gain 0.8 (0.7 .. 0.9), 95 %, the sensor's noise included." There is none where the
+    sensor or channel varies over time, or depends on inputs or the past.
+    """
+    description = solution.surface.objective.description
+    _, sensor, channel = join_all_nodes(description.start)
+    if isinstance(sensor, OverTime) or not _is_route_constant(sensor, channel):
+        return []
+
+    def compute_moments_at(x: Array) -> jax.Array:
+        """Return mean gain, gain variance and noise of each output at a point x (p,) of the line, (outputs, 3)."""
+        _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
+        return _compute_link_moments(first(sensor), first(channel))
+
+    with jax.enable_x64(True):
+        x = jnp.asarray(solution.x)
+        moments = np.asarray(compute_moments_at(x))  # (outputs, 3)
+        slopes = np.asarray(jax.jacfwd(compute_moments_at)(x))[:, :, solution.active]  # (outputs, 3, active)
+    # Intervals of what is identified: a function with the derivatives g has the variance g' C g.
+    covariance, freedom = solution.covariance()
+    names = sensor.outputs if len(sensor.outputs) == len(moments) else [f"z{i}" for i in range(len(moments))]
+    lines = []
+    for name, values, gradients in zip(names, moments, slopes, strict=True):
+        found = []
+        for kind, value, gradient in zip(KINDS, values, gradients, strict=True):
+            if solution.identifies(gradient):
+                reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+                found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")
+        if found:
+            lines.append(f"The received {name} has {', '.join(found)}, 95 %, the sensor's noise included.")
+    return lines
+
+
+def _is_route_constant(sensor: AbstractSensor, channel: Channel) -> bool:
+    """Return whether a channel is the same at each step, and it and the sensor depend on no inputs and no past."""
+    return not (isinstance(channel, OverTime) or sensor.inputs or channel.remembers or channel.past)
+
+
+def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) -> jax.Array:
+    """Return mean gain, gain variance and noise variance of each output behind a link, (outputs, 3).
+
+    Of each output the gain is that of the measured value of which it has most. The noise is that of sensor and channel
+    together: the diagonal of M R M' + spread of the constant part, with the mean gain M and the sensor's covariance R.
+    """
+    moments, r = second_order(link), jnp.asarray(sensor.noise.covariance)
+    mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
+    spread = jnp.asarray(moments.nominal.center)
+    whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
+    noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))
+    # Of each output the gain of the measured value that it has most of.
+    strongest = jnp.argmax(jnp.abs(mean), axis=1)
+    rows = jnp.arange(len(mean))
+    return jnp.stack([mean[rows, strongest], spread[rows, rows, strongest, strongest], noise], axis=1)

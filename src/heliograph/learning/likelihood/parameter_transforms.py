@@ -1,0 +1,128 @@
+"""Transforms of free numbers on their domains to unbounded coordinates (logarithms, logits), and back."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import expit
+
+from heliograph.numerics.check import Domain, fail
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array, Float, PyTree
+
+
+def map_to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
+    """Return the start `value` of the free number `name` as unbounded coordinates (size,).
+
+    Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
+    by row, those on the diagonal by their logarithms.
+
+    Raises:
+        ValueError: a start that is not inside the domain.
+    """
+    if domain.kind == "simplex":
+        if not np.all(value > 0) or np.any(np.abs(value.sum(axis=-1) - 1) > 1e-9):
+            raise fail(f"start of {name}", "positive probabilities that sum to 1", value.tolist())
+        logs: np.ndarray = np.log(value[..., :-1] / value[..., -1:])
+        return logs.reshape(-1)
+    if domain.kind == "covariance":
+        factor = _factorise_start(name, value)
+        np.fill_diagonal(factor, np.log(np.diagonal(factor)))
+        return np.asarray(factor[np.tril_indices(len(value))])
+    if np.any(value <= domain.low) or np.any(value >= domain.high):
+        raise fail(f"start of {name}", f"a start {_describe_domain(domain)}", value.tolist())
+    return np.asarray(to_line(domain, value)).reshape(-1)
+
+
+def map_from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
+    """Return the number, of this shape, whose coordinates on the line are x (size,), as `map_to_line` makes them.
+
+    JAX can trace it; plain coordinates of an interval give a plain number.
+    """
+    if domain.kind == "simplex":
+        return _map_to_simplex(shape, x)
+    # A covariance L L', with the entries of L row by row, those on its diagonal by their logarithms.
+    if domain.kind == "covariance":
+        factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
+        of_diagonal = jnp.exp(jnp.diag(jnp.diag(factor)))  # of the diagonal alone, as other entries might overflow
+        factor = jnp.where(np.eye(shape[0], dtype=bool), of_diagonal, factor)
+        return factor @ factor.T
+    # An interval: by the logistic function between two ends, an exponential from one, as it is without ends.
+    xp = library(x)
+    coordinates: Array = xp.reshape(x, shape)
+    has_low, has_high = np.isfinite(domain.low), np.isfinite(domain.high)
+    if has_low and has_high:
+        logistic = expit if xp is np else jax.nn.sigmoid
+        return domain.low + (domain.high - domain.low) * logistic(coordinates)
+    if not (has_low or has_high):
+        return coordinates
+    with np.errstate(over="ignore"):  # to infinity, far from the end
+        distance: Array = xp.exp(coordinates)
+    return domain.low + distance if has_low else domain.high - distance
+
+
+def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
+    """Return probabilities p_i = exp(x_i) / sum_j exp(x_j) over the last axis, of which the last has x = 0."""
+    rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
+    logs = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
+    weights = jnp.exp(logs - jnp.max(logs, axis=-1, keepdims=True))  # the largest is 1, so that none overflows
+    return weights / jnp.sum(weights, axis=-1, keepdims=True)
+
+
+def to_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return a number of an interval on the line: as logit, logarithm or itself, by the ends that the interval has."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return np.log((value - domain.low) / (domain.high - value))
+    if np.isfinite(domain.low):
+        return np.log(value - domain.low)
+    return np.log(domain.high - value) if np.isfinite(domain.high) else value
+
+
+def from_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the number of the interval that `to_line` maps to this value; an end of it for infinite values."""
+    with np.errstate(over="ignore"):
+        if np.isfinite(domain.low) and np.isfinite(domain.high):
+            return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
+        if np.isfinite(domain.low):
+            return domain.low + np.exp(value)
+        return domain.high - np.exp(value) if np.isfinite(domain.high) else value
+
+
+def slope_from_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `from_line` at a value of the line."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
+    if np.isfinite(domain.low):
+        return np.exp(value)
+    return -np.exp(value) if np.isfinite(domain.high) else np.ones_like(value)
+
+
+def slope_to_line(domain: Domain, value: PyTree) -> PyTree:
+    """Return the derivative of `to_line` at a number of the interval."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
+    if np.isfinite(domain.low):
+        return 1 / (value - domain.low)
+    return -1 / (domain.high - value) if np.isfinite(domain.high) else np.ones_like(value)
+
+
+def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
+    """Return how many coordinates on the line a number of this domain and shape has."""
+    count = int(np.prod(shape))
+    if domain.kind == "simplex":
+        return count - count // shape[-1]
+    return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
+
+
+def _factorise_start(name: str, value: np.ndarray) -> np.ndarray:
+    """Return Cholesky's factor L of the start L L' of the free number `name`; raise if it is not positive definite."""
+    try:
+        return np.linalg.cholesky(value)
+    except np.linalg.LinAlgError:
+        raise fail(f"start of {name}", "a positive definite matrix", value.tolist()) from None
+
+
+def _describe_domain(domain: Domain) -> str:
+    """Return in words where an interval's numbers lie."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return f"between {domain.low:g} and {domain.high:g}"
+    return f"above {domain.low:g}" if np.isfinite(domain.low) else f"below {domain.high:g}"

@@ -1,0 +1,170 @@
+"""Covariance of estimates from scores correlated over time (long-run, sandwich), and quantiles of intervals."""
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import scipy
+
+from heliograph.numerics.types import Bool, Float
+
+
+def estimate_long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
+    """Return sqrt(Var(sum of T values) / T) of a series (steps,), correlated over time, by Bartlett's weights."""
+    total = estimate_by_bartlett([values[:, None] - values.mean()]).covariance
+    return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
+
+
+def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
+    """Return the mean of a series (steps,), and its standard error."""
+    return float(values.mean()), estimate_long_run_deviation(values) / float(np.sqrt(len(values)))
+
+
+Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]
+METHODS = get_args(Method)
+LEVEL = 0.95
+DRAWS = 999  # of the bootstrap
+FEW = 1 / 3  # share of the data in which the information on a number lies, below which scores do not tell its spread
+
+Scores = list[Float[np.ndarray, "steps p"]]
+
+
+class LongRunCovariance(NamedTuple):
+    """Covariance of the sum of scores, and the degrees of freedom with which it is known."""
+
+    covariance: Float[np.ndarray, "p p"]
+    freedom: float
+
+
+def count_cosines(steps: int) -> int:
+    """Return the number of cosines by which the scores of so many steps are judged, nu = floor(0.4 T^(2/3))."""
+    return max(int(0.4 * steps ** (2 / 3)), 1)
+
+
+def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "steps k"]]) -> Bool[np.ndarray, " k"]:
+    """Return which of k numbers have their information in a few of the nu stretches of the data, (k,).
+
+    `information`: of each recording that of each row on each number (steps, k). With the information V_b of stretch b,
+    (sum_b V_b)^2 / sum_b V_b^2 is the number of stretches if all tell the same, and 1 if one tells all. The scores of
+    such numbers vary within a few stretches alone, in which cosines hardly change: they see next to nothing of it.
+    """
+    by_recording = []
+    for rows in information:
+        count = count_cosines(len(rows))
+        begins = np.arange(count) * len(rows) // count
+        by_recording.append(np.add.reduceat(rows, begins, axis=0))  # sums over each stretch
+    stretches = np.maximum(np.concatenate(by_recording), 0.0)  # V, (stretches, k)
+    return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
+
+
+def remove_predicted_scores(
+    scores: Scores, hessian: Float[np.ndarray, "p p"], few: Bool[np.ndarray, " p"]
+) -> tuple[Scores, Float[np.ndarray, "p p"]]:
+    """Return scores less what the scores of a few numbers K predict of them, and the covariance of that prediction.
+
+    s - H_.K H_KK^-1 s_K and H_.K H_KK^-1 H_K., with the scores s of each step, the Hessian H of minus the
+    log-likelihood and K the numbers of the mask `few`: where the model is true the two parts are uncorrelated, and the
+    covariances of their sums add up to H.
+    """
+    coefficients = np.linalg.solve(hessian[np.ix_(few, few)], hessian[few])  # (few, p)
+    return [s - s[:, few] @ coefficients for s in scores], hessian[:, few] @ coefficients
+
+
+def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
+    """Return the long-run covariance (T/nu) sum_j G_j G_j' of scores, summed over series, with its degrees of freedom.
+
+    G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)), of each series s of T steps.
+
+    Source: Müller, HAC corrections for strongly autocorrelated time series (2014); Lazarus, Lewis, Stock and Watson,
+    HAR inference (2018).
+    """
+    covariances, steps_and_cosines = [], []
+    for s in scores:
+        steps = len(s)
+        count = count_cosines(steps)
+        g = np.sqrt(1 / (2 * steps)) * scipy.fft.dct(s, axis=0)[1 : count + 1]  # SciPy's sum has the factor 2
+        covariances.append(steps / count * g.T @ g)
+        steps_and_cosines.append((steps, count))
+    # Each series has nu degrees of freedom; those of the sum by Satterthwaite's rule, with variances as the steps.
+    total = sum(steps for steps, _ in steps_and_cosines)
+    freedom = total**2 / sum(steps**2 / count for steps, count in steps_and_cosines)
+    return LongRunCovariance(np.sum(covariances, axis=0), freedom)
+
+
+def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
+    """Return the long-run covariance of scores with Bartlett's weights, summed over series.
+
+    sum_|l|<=L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)), of each series s of T steps.
+
+    Source: Newey and West (1987).
+    """
+    covariances = []
+    for s in scores:
+        lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
+        products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
+        covariances.append(products[0] + sum(product + product.T for product in products[1:]))
+    return LongRunCovariance(np.sum(covariances, axis=0), freedom=np.inf)
+
+
+def estimate_if_white(scores: Scores) -> LongRunCovariance:
+    """Return the covariance of the sum of scores, sum_t s_t s_t', taken for uncorrelated over time (white)."""
+    return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
+
+
+def bootstrap_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
+    """Return sums of scores over blocks of 2 T^(1/3) steps drawn with replacement, less their mean, (draws, p).
+
+    Of each series of T steps about T blocks' worth of steps is drawn, and the sums of all series are added.
+
+    Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
+    """
+    rng = np.random.default_rng(seed)
+    total = np.zeros((draws, scores[0].shape[1]))
+    for s in scores:
+        length = min(max(int(np.ceil(2 * len(s) ** (1 / 3))), 1), len(s))
+        running = np.concatenate([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
+        block_sums = running[length:] - running[:-length]  # of the block that begins at each step
+        # The series has `count` blocks, of which a whole number is drawn; the variance is scaled to all.
+        count = len(s) / length
+        whole = max(int(count), 1)
+        drawn = block_sums[rng.integers(0, len(block_sums), (draws, whole))].sum(axis=1)
+        total += (drawn - whole * block_sums.mean(axis=0)) * np.sqrt(count / whole)
+    return total
+
+
+def estimate_long_run_covariance(
+    method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]
+) -> LongRunCovariance:
+    """Return the covariance of the sum of scores by a method of `Fit.rows`, with its degrees of freedom.
+
+    Of "hessian" and "profile" it is the Hessian of -l, as in a right model.
+    """
+    match method:
+        case "bootstrap":
+            sums = bootstrap_block_sums(scores, DRAWS, 0)
+            return LongRunCovariance(np.atleast_2d(np.cov(sums.T)), freedom=np.inf)
+        case "cosines":
+            return estimate_by_cosines(scores)
+        case "bartlett":
+            return estimate_by_bartlett(scores)
+        case "white":
+            return estimate_if_white(scores)
+        case "hessian" | "profile":
+            return LongRunCovariance(hessian, freedom=np.inf)
+
+
+def student_quantile(freedom: float, level: float = LEVEL) -> float:
+    """Return how many standard errors an interval of this level reaches to each side: a quantile of Student's law."""
+    return float(scipy.stats.t.ppf((1 + level) / 2, freedom))
+
+
+def find_profile_drop(level: float) -> float:
+    """Return by how many nats a profile likelihood is lower at the ends of an interval: half a chi-square quantile."""
+    return float(scipy.stats.chi2.ppf(level, 1)) / 2
+
+
+def compute_sandwich_covariance(
+    hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, "p p"]:
+    """Return the covariance H^-1 J H^-1 of estimates, H the Hessian of -l and J the covariance of summed scores."""
+    half = np.linalg.solve(hessian, scores)
+    return np.asarray(np.linalg.solve(hessian, half.T))

@@ -1,0 +1,206 @@
+"""Losses of a link that is good or bad for a while, as a hidden mode: its two-mode filter and its likelihood."""
+
+import numpy as np
+
+from heliograph.learning.packet_losses.loss_laws import AbstractLossLaw, Packets
+from heliograph.learning.packet_losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, keep_ends_only
+from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_over_shares
+from heliograph.model.channel import erasure
+from heliograph.model.fading import gilbert_elliott
+from heliograph.random_affine.base import AbstractRandomAffine
+
+STEP = 1e-20  # of the complex step, whose error is its square
+UNKNOWN, START = 2, 3  # kinds of runs of packets, after arrived (0) and lost (1)
+
+STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells, two rates that hardly differ
+    logits(0.02, 0.9, 0.05, 0.5),
+    logits(0.05, 0.5, 0.005, 0.02),
+    logits(0.1, 0.3, 0.1, 0.1),
+)
+
+
+class HiddenModeLosses(AbstractLossLaw):
+    """Hidden mode, good or bad, that fails and recovers as a chain; a packet is lost with the mode's probability.
+
+    Args:
+        good_loss: probability of a loss in the good mode.
+        bad_loss: probability of a loss in the bad mode.
+        fail: probability that the good mode turns bad before the next packet.
+        recover: probability that the bad mode turns good before the next packet.
+
+    Source: Gilbert (1960), Elliott (1963).
+    """
+
+    good_loss: Share
+    bad_loss: Share
+    fail: Share
+    recover: Share
+
+    @staticmethod
+    def fit(fates: object, intervals: bool = True) -> "HiddenModeLosses":
+        """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        stretches = check_fates(fates)
+        # Of stretches that were chosen for ends that arrived: log P(fates) - log P(ends arrive).
+        chosen = [keep_ends_only(fate) for fate in stretches if fate[-1] == CHOSEN]
+        whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
+
+        def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            value, gradient = whole.likelihood(x)
+            if ends is None:
+                return value, gradient
+            value_of_ends, gradient_of_ends = ends.likelihood(x)
+            return value - value_of_ends, gradient - gradient_of_ends
+
+        top, value = maximise_over_shares(likelihood, [*STARTS])
+        good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
+        if good.estimate > bad.estimate:  # the good mode is the one that loses less
+            good, bad, fails, recovers = bad, good, recovers, fails
+        return HiddenModeLosses(good_loss=good, bad_loss=bad, fail=fails, recover=recovers)
+
+    def shares(self) -> dict[str, Share]:
+        """Return the losses of each mode and the chain's probabilities, with likelihood intervals."""
+        return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Return the probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        good, bad, fails, recovers = (share.estimate for share in self.shares().values())
+        away = fails + recovers
+        is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
+        probabilities = np.zeros(len(fate))
+        for k, observed in enumerate(fate.tolist()):
+            p = (1 - is_bad) * good + is_bad * bad
+            probabilities[k] = p
+            # Bayes' rule on a known fate, then the step of the chain.
+            if observed == 1 and p > 0:
+                is_bad = is_bad * bad / p
+            elif observed == 0 and p < 1:
+                is_bad = is_bad * (1 - bad) / (1 - p)
+            is_bad = (1 - is_bad) * fails + is_bad * (1 - recovers)
+        return probabilities
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link in two modes (`gilbert_elliott`) with the losses of each."""
+        good, bad = (erasure(link, 1 - share.estimate) for share in (self.good_loss, self.bad_loss))
+        return gilbert_elliott(good, bad, self.fail.estimate, self.recover.estimate)
+
+
+class FateRuns:
+    """Stretches as runs of equal fates, whose matrices are powers: the likelihood needs one product for each run.
+
+    The likelihood of a stretch is 1' A_n T' A_(n-1) ... T' A_1 p, with A the diagonal of the fate's probabilities in
+    each mode, T the transition and p its stationary law. Between stretches stands p 1', which starts anew; one more T'
+    after the last A changes nothing, 1' T' = 1', so that each A is followed by one.
+
+    Args:
+        kind: of each run: 0 arrived, 1 lost, UNKNOWN, or START before a stretch (runs,).
+        length: number of packets in each run (runs,).
+    """
+
+    def __init__(self, kind: np.ndarray, length: np.ndarray):
+        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has."""
+        self.kind = kind
+        masks = {int(fate): kind == fate for fate in np.unique(kind)}
+        self.runs_by_kind = {
+            fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()
+        }
+
+    @staticmethod
+    def of(fates: Fates) -> "FateRuns":
+        """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
+        code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
+        first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
+        return FateRuns(code[first], np.diff(np.append(first, len(code))))
+
+    def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
+
+        By complex steps: the imaginary part of l(x + i h) is h dl/dx.
+        """
+        # Rows 0 to 3 have a step in one logit each, row 4 none.
+        shifted = np.broadcast_to(x, (5, 4)).astype(complex)
+        shifted[np.arange(4), np.arange(4)] += 1j * STEP
+        total = self._compute_log_likelihoods(1 / (1 + np.exp(-shifted)))
+        return float(total[4].real), np.asarray(total[:4].imag / STEP)
+
+    def _compute_log_likelihoods(self, shares: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of all stretches for several sets of shares, (sets,); shares may be complex.
+
+        It is the log of 1' (T' A)^n ... (T' A)^m p, a product over runs of equal fates: the first has m packets, the
+        last n. A has the probabilities of a run's fate in each mode, T is the transition of the modes, and p their
+        stationary law.
+
+        `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover.
+        """
+        good, bad, fails, recovers = shares.T
+        ones = np.ones_like(good)
+        # T', with a column for each present mode; the diagonal of A for each fate; p 1', for the start of a stretch.
+        transposed = _stack_matrices([[1 - fails, recovers], [fails, 1 - recovers]])
+        probabilities = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [ones, ones]}
+        away = fails + recovers  # probability to leave a mode, of both together
+        start = _stack_matrices([[recovers / away] * 2, [fails / away] * 2])
+        # (T' A)^length of each run, as a matrix and the logarithm of its scale, computed once for each length.
+        matrices = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
+        scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
+        for kind, (runs, lengths, length_of_run) in self.runs_by_kind.items():
+            if kind == START:
+                matrices[:, runs] = start[:, None]
+                continue
+            step = transposed * np.stack(probabilities[kind], axis=-1)[:, None, :]  # T' A
+            power, scale = _raise_matrices(step, lengths)
+            matrices[:, runs], scales[:, runs] = power[:, length_of_run], scale[:, length_of_run]
+        product, scale = _multiply_runs(matrices)
+        # The first run is a START, so that the product is (...) p 1', whose columns agree: 1' (...) p sums one.
+        probability = product.sum(axis=-2)[..., 0]
+        return np.asarray(np.log(probability) + scale + scales.sum(axis=1))
+
+
+def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Return 2 x 2 matrices (sets, 2, 2) from rows of entries, each an array (sets,)."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrices (..., 2, 2) over their largest real part, lest products underflow, and its logarithm (...)."""
+    rows = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
+    size = np.maximum(rows[..., 0], rows[..., 1])
+    size = np.where(size > 0, size, 1.0)
+    return matrix * (1 / size)[..., None, None], np.log(size)  # a division by a real number would be a complex one
+
+
+def _raise_matrices(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return each matrix (sets, 2, 2) to the power of each length, (sets, lengths, 2, 2), and logarithms of scales.
+
+    A power is the returned matrix times its scale. By the binary digits of the lengths: `square` is the matrix to the
+    power 1, 2, 4, ...
+    """
+    shape = (len(matrix), len(lengths))
+    power = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
+    scale, (square, square_scale) = np.zeros(shape), _rescale_matrices(matrix)
+    digits = lengths.copy()
+    while np.any(digits):
+        odd = (digits & 1).astype(bool)  # lengths that have this binary digit
+        power = np.where(odd[:, None, None], square[:, None] @ power, power)
+        power, more = _rescale_matrices(power)
+        scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
+        digits = digits >> 1
+        square, more = _rescale_matrices(square @ square)
+        square_scale = 2 * square_scale + more
+    return power, scale
+
+
+def _multiply_runs(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the logarithm of its scale.
+
+    The product is the returned matrix (sets, 2, 2) times its scale (sets,). Pair by pair: each turn halves the number.
+    """
+    scale = np.zeros(len(parts))
+    while parts.shape[1] > 1:
+        if parts.shape[1] % 2:
+            parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
+        parts, more = _rescale_matrices(parts[:, 1::2] @ parts[:, ::2])
+        scale = scale + more.sum(axis=1)
+    return parts[:, 0], scale

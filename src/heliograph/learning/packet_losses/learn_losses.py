@@ -1,0 +1,303 @@
+"""Losses learned from a recording: laws fitted, tests of their memory, drifting rates, the law that predicts best."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from scipy.special import expit, xlogy
+
+from heliograph.learning.long_run_covariance import estimate_mean_and_error
+from heliograph.learning.packet_losses.hidden_mode_losses import HiddenModeLosses
+from heliograph.learning.packet_losses.loss_laws import AbstractLossLaw, IndependentLosses, MarkovLosses, Packets
+from heliograph.learning.packet_losses.packet_fates import CheckedFates, Fates, check_fates, fill_ends, find_trials
+from heliograph.learning.packet_losses.probability_intervals import Share, estimate_shares, logits, maximise_over_shares
+from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.module import readable
+from heliograph.random_affine.base import AbstractRandomAffine
+
+INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
+
+LONG = 4  # packets back that the longer of the two chains looks
+LEVEL = 0.01  # probability that independent losses are said to have memory
+
+
+class HeldOutScores(NamedTuple):
+    """Scores of a law on packets that it was not fitted to.
+
+    log_likelihood: mean over packets, nats. gain: difference from that of independent losses; gain_error: its standard
+    error, which allows for correlation over time.
+    """
+
+    log_likelihood: float
+    gain: float
+    gain_error: float
+
+
+@readable
+class LossMemory(NamedTuple):
+    """Result of two tests of losses that are independent by assumption.
+
+    Args:
+        likelihood_ratio: 2 (l1 - l0) of a first-order chain on the packets whose predecessor is known; chi-square with
+            one degree of freedom if the losses are independent.
+        likelihood_p: its p-value.
+        runs_z: number of runs of equal fates, less what is expected, in standard deviations: negative for bursts.
+        runs_p: its two-sided p-value.
+    """
+
+    likelihood_ratio: float
+    likelihood_p: float
+    runs_z: float
+    runs_p: float
+
+    @property
+    def significant(self) -> bool:
+        """True if the likelihood ratio rejects independence at 1 %."""
+        return self.likelihood_p < 0.01
+
+    @classmethod
+    def of(cls, fates: object) -> "LossMemory":
+        """Test losses that the receiver knows of for memory; where nothing varies there is no evidence, p = 1.
+
+        Args:
+            fates: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a list of stretches.
+
+        Raises:
+            ValueError: what is no fates (see `heliograph.learning`).
+        Source: Anderson and Goodman (1957); Wald and Wolfowitz (1940), given the losses of each unbroken stretch.
+        """
+        # The likelihood ratio of a chain, whose losses depend on the packet before, and of independent losses: those
+        # have one law for both rows of the counts.
+        counts = MarkovLosses.fit(fates, intervals=False).counts
+        both = counts.sum(axis=0)
+        ratio = max(2 * (_compute_maximum_log_likelihood(counts) - _compute_maximum_log_likelihood(both[None])), 0.0)
+        # Wald and Wolfowitz: of n packets, n1 lost and n0 arrived, the number of runs of equal fates has the mean
+        # 1 + 2 n1 n0 / n. `excess` is how many more there are, with its variance, over all unbroken stretches.
+        excess, variance = 0.0, 0.0
+        for stretch in check_fates(fates):
+            # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
+            for lost in _split_at_unknown(np.where(find_trials(stretch), stretch, np.nan)):
+                n, losses = len(lost), float(lost.sum())
+                pairs = 2 * losses * (n - losses)  # 2 n1 n0
+                runs = 1 + np.sum(np.diff(lost) != 0)
+                excess += runs - (1 + pairs / n)
+                variance += pairs * (pairs - n) / (n**2 * (n - 1)) if n > 1 else 0.0
+        z = float(excess / np.sqrt(variance)) if variance > 0 else 0.0
+        return cls(
+            likelihood_ratio=float(ratio),
+            likelihood_p=float(scipy.stats.chi2.sf(ratio, 1)),
+            runs_z=z,
+            runs_p=float(2 * scipy.stats.norm.sf(abs(z))),
+        )
+
+
+@readable
+@dataclass(frozen=True)
+class Losses:
+    """Losses of a recording: fitted laws, tests of memory, and how well each law predicts.
+
+    Args:
+        packets: number of packets whose fate is known.
+        lost: number of these that were lost.
+        laws: fitted to all packets, by name: "independent", "markov", "markov_4", "hidden", "running".
+        memory: tests of independence on all packets.
+        held_out: scores of each law on the later packets, when fitted to the earlier ones alone; empty where one part
+            is too short.
+        best: name of the law that predicts best of those whose likelihood ratio is significant; "independent" where
+            none is. Where nothing was held out, "hidden" if that is significant.
+        best_channel: the same among the laws that a channel can have, which are all but "running".
+    """
+
+    packets: int
+    lost: int
+    laws: dict[str, AbstractLossLaw]
+    memory: LossMemory
+    held_out: dict[str, HeldOutScores]
+    best: str
+    best_channel: str
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link with the losses of the law `best_channel`."""
+        return self.laws[self.best_channel].channel(link)
+
+
+def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
+    """Fit four kinds of laws to losses, test for memory, and choose by how well the laws predict the later packets.
+
+    Losses are independent unless another law is significant: twice its gain of log-likelihood on all packets is above
+    the chi-square quantile of the numbers that it has more, at 1 % for the four other laws together, a quarter each. Of
+    these laws and "independent" the one is chosen under which the later packets are most likely.
+
+    Args:
+        fates: a stretch of 0 (arrived), 1 (lost) and NaN (unknown), or several in the order of time, as
+            `fates_of_sequence`, `fates_by_node`, `fates_by_hop` and `fates_of_measurements` give them.
+        held_out: share of the packets, the last ones, that are not fitted to but choose; a third by default.
+
+    Raises:
+        ValueError: what is no fates, a share outside [0, 1).
+    """
+    parts = check_fates(fates)
+    share = float(scalar("held-out share", held_out, 0.0, 1.0))
+    if share == 1.0:
+        raise fail("held-out share", "less than 1: something must be fitted", share)
+    known = find_trials(np.concatenate(parts))
+    cut = int(np.floor(known.sum() * (1 - share)))
+    held_out_scores = _score_held_out(parts, known, cut) if 0 < cut < known.sum() else {}
+    laws = _fit_laws(parts, intervals=True)
+    significant = _find_significant_laws(laws, parts)
+    best = _choose_law(significant, held_out_scores)
+    best_channel = _choose_law(significant - {RUNNING}, held_out_scores)
+    return Losses(
+        packets=int(known.sum()),
+        lost=int(np.sum(np.concatenate(parts) == 1)),
+        laws=laws,
+        memory=LossMemory.of(parts),
+        held_out=held_out_scores,
+        best=best,
+        best_channel=best_channel,
+    )
+
+
+def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
+    """Return the names of laws that a likelihood ratio test prefers to independent losses, at LEVEL for all of them."""
+    level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
+    total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
+    significant = set[str]()
+    for name, law in laws.items():
+        ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
+        if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
+            significant.add(name)
+    return significant
+
+
+def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
+    """Return the law of the largest held-out likelihood, by name, among the significant ones and independent losses.
+
+    Without scores it is "hidden" where that is significant.
+    """
+    if not held_out:
+        return HIDDEN if HIDDEN in significant else INDEPENDENT
+    candidates = [name for name in held_out if name in {INDEPENDENT, *significant}]
+    return max(candidates, key=lambda name: held_out[name].log_likelihood)
+
+
+def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
+    """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for."""
+    return {
+        INDEPENDENT: IndependentLosses.fit(parts),
+        "markov": MarkovLosses.fit(parts, intervals=intervals),
+        f"markov_{LONG}": MarkovLosses.fit(parts, LONG),
+        HIDDEN: HiddenModeLosses.fit(parts, intervals),
+        RUNNING: RunningRateLosses.fit(parts, intervals),
+    }
+
+
+def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
+    """Return by name the scores of the laws on later packets, each given all before it, when fitted to the first `cut`.
+
+    `parts`: stretches of fates; `known`: which packets are trials, of all stretches one after another.
+    """
+    everything = np.concatenate(parts)
+    late = known & (np.cumsum(known) > cut)
+    early = np.where(late, np.nan, everything)
+    ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
+    laws = _fit_laws(CheckedFates(np.split(early, ends)), intervals=False)
+    log_likelihoods = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
+    scores = {}
+    for name, logs in log_likelihoods.items():
+        gain, error = estimate_mean_and_error(logs - log_likelihoods[INDEPENDENT])
+        scores[name] = HeldOutScores(log_likelihood=float(logs.mean()), gain=gain, gain_error=error)
+    return scores
+
+
+def _compute_maximum_log_likelihood(counts: np.ndarray) -> float:
+    """Return the maximum of the log-likelihood of counts n_ab (past a, fate b): sum n_ab log(n_ab / n_a)."""
+    rows = counts.sum(axis=1, keepdims=True)
+    return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
+
+
+def _split_at_unknown(fate: np.ndarray) -> list[np.ndarray]:
+    """Return the parts of a stretch of fates between unknown ones (NaN), without these."""
+    edges = np.flatnonzero(np.isnan(fate))
+    return [stretch[~np.isnan(stretch)] for stretch in np.split(fate, edges) if np.any(~np.isnan(stretch))]
+
+
+STARTS = (logits(0.2, 0.8, 0.05), logits(0.2, 0.5, 0.3), logits(0.2, 0.95, 0.01))
+
+
+class RunningRateLosses(AbstractLossLaw):
+    """Losses whose rate drifts: P(lost) = (1 - weight) base + weight r, r <- r + step (lost - r) after a known fate.
+
+    A yardstick for the others: where it predicts as well as a hidden mode, the rate drifts. No channel has it.
+
+    Args:
+        base: rate from which r begins, and to which the probability is drawn.
+        weight: share of the running rate r in the probability.
+        step: share of the last fate in the running rate.
+    """
+
+    base: Share
+    weight: Share
+    step: Share
+
+    @staticmethod
+    def fit(fates: object, intervals: bool = True) -> "RunningRateLosses":
+        """Fit by maximum likelihood from three starts, with intervals by the profile of the likelihood.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        parts = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
+        trials, parts = [find_trials(stretch) for stretch in parts], [fill_ends(stretch) for stretch in parts]
+
+        def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
+            # A share p has the derivative p (1 - p) by its logit.
+            share = expit(x)
+            total, gradient = 0.0, np.zeros(len(x))
+            for stretch, trial_mask in zip(parts, trials, strict=True):
+                value, slope = _sum_log_probabilities(stretch, _predict_losses(stretch, *share), trial_mask)
+                total, gradient = total + value, gradient + slope
+            return total, gradient * share * (1 - share)
+
+        top, value = maximise_over_shares(likelihood, [*STARTS])
+        return RunningRateLosses(*estimate_shares(likelihood, top, value, intervals))
+
+    def shares(self) -> dict[str, Share]:
+        """Return the base, weight and step with likelihood intervals."""
+        return {name: getattr(self, name) for name in ("base", "weight", "step")}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Return the probability of each loss by the running rate; an unknown fate leaves it where it is."""
+        known = ~np.isnan(fate)
+        base, weight, step = (share.estimate for share in self.shares().values())
+        at_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)  # also after the last known one
+        return np.asarray(at_known[np.cumsum(known) - known])
+
+
+def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> tuple[Packets, Packets]:
+    """Return P(lost) of each packet by the running rate r, and its derivatives in base, weight and step (3, packets).
+
+    With d = r - base: P(lost) = base + weight d, and d+ = (1 - step) d + step (lost - base) from d = 0 on; so its
+    derivatives are recursions of the same kind, run as linear filters. `lost`: the fates, 1 where a packet was lost.
+    """
+    last_fate = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
+    keep = [1.0, step - 1.0]
+    d = scipy.signal.lfilter([step], keep, last_fate)
+    by_base = scipy.signal.lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
+    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - d)])[: len(lost)])
+    return base + weight * d, np.stack([1 + weight * by_base, d, weight * by_step])
+
+
+def _sum_log_probabilities(
+    lost: Packets, predictions: tuple[Packets, Packets], trials: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return the log-likelihood of the fates `lost` that are trials, and its gradient in base, weight and step (3,).
+
+    `predictions`: P(lost) of each packet, and its derivatives (3, packets).
+    """
+    p, slope = predictions
+    p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are numbers
+    logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
+    return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)

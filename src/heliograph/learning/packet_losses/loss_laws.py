@@ -1,0 +1,290 @@
+"""Laws of losses: the probability that a packet is lost, given what became of those before it."""
+
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from heliograph.learning.packet_losses.packet_fates import CHOSEN, Fates, check_fates, fill_ends, find_trials
+from heliograph.learning.packet_losses.probability_intervals import estimate_shares, logits, maximise_over_shares
+from heliograph.model.channel import erasure
+from heliograph.model.fading import gilbert_elliott, markov_fading
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.confidence_intervals import Share, wilson
+from heliograph.numerics.module import Module, readable, unwritten
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.markov_chain_and_autoregression import MarkovChain
+
+Law = TypeVar("Law", bound="AbstractLossLaw")
+Packets = Float[np.ndarray, " packets"]
+
+
+@readable
+class AbstractLossLaw(Module):
+    """Law of observed losses. Subclasses define `shares`, `predicted`, and `channel` where one has such losses.
+
+    The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;
+    each stretch starts in the stationary law. Of a stretch between two packets that are its ends because they arrived
+    (`fates_of_sequence`) it is that of the packets between, given that both ends arrived:
+    log P(fates) - log P(ends), where P(ends) is the probability that the two arrive, whatever became of the others.
+    """
+
+    def shares(self) -> dict[str, Share]:
+        """Return the estimates with their intervals, by name."""
+        raise unwritten(self, "shares")
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Return the probability that each packet of a stretch is lost, given those before it."""
+        raise unwritten(self, "predicted")
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link with such losses, which the receiver knows of.
+
+        Raises:
+            ValueError: a law that no channel has.
+        """
+        raise fail(f"channel with {type(self).__name__}", "a law with finitely many states", "a rate that drifts")
+
+    def log_likelihoods(self, fates: object) -> Packets:
+        """Return log P(fate | those before) of each packet of all stretches; NaN where the fate is unknown.
+
+        A last packet that is an end because it arrived has log P(arrived | those before) - log P(arrived | the first).
+
+        Raises:
+            ValueError: what is no fates (see `heliograph.learning`).
+        """
+        parts = check_fates(fates)
+        return np.concatenate([self._score_stretch(stretch) for stretch in parts])
+
+    def _score_stretch(self, fate: Packets) -> Packets:
+        """Return log P(fate | those before) of each packet of a stretch (packets,); NaN where the fate is unknown.
+
+        Of a stretch that was chosen for its ends the last one has log P(arrived | those before) - log P(arrived | the
+        first), so that the sum is the log-likelihood given both ends.
+        """
+        p = self.predicted(fill_ends(fate))
+        with np.errstate(divide="ignore"):
+            logs: Packets = np.where(find_trials(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
+        if fate[-1] == CHOSEN and len(fate) > 2:
+            logs[-1] = np.log1p(-p[-1]) - np.log(self._compute_return_probability(len(fate) - 1))
+        return logs
+
+    def _compute_return_probability(self, steps: int) -> float:
+        """Return P(arrived after so many steps | arrived now), whatever became of the packets between."""
+        fate = np.full(steps + 1, np.nan)
+        fate[0] = 0.0
+        return 1.0 - float(self.predicted(fate)[-1])
+
+
+class IndependentLosses(AbstractLossLaw):
+    """Independent losses: each packet is lost with the same probability, whatever became of the others.
+
+    Args:
+        lost: number of packets that were lost.
+        packets: number of packets whose fate is known.
+    """
+
+    lost: int
+    packets: int
+
+    @staticmethod
+    def fit(fates: object) -> "IndependentLosses":
+        """Return the law of the share of losses, by counting.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        known = np.concatenate(check_fates(fates))
+        return IndependentLosses(int(np.sum(known == 1)), int(np.sum(find_trials(known))))
+
+    def shares(self) -> dict[str, Share]:
+        """Return the share of losses, lost / packets, with Wilson's interval."""
+        return {"loss": wilson(self.lost, self.packets)}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Return the probability (k + 1/2) / (n + 1) of each loss, so that none is impossible."""
+        return np.full(len(fate), (self.lost + 0.5) / (self.packets + 1))
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link behind an erasure."""
+        return erasure(link, 1 - self.lost / self.packets)
+
+
+class MarkovLosses(AbstractLossLaw):
+    """Losses as a Markov chain: the probability depends on what became of the last `order` packets.
+
+    Args:
+        counts: (arrived, lost) after each past (2^order, 2); a past is a number whose bits are the last fates, the
+            latest one lowest.
+        given_ends: P(lost | arrived) and P(arrived | lost) with likelihood intervals, of a chain between ends
+            that arrived for being ends; none where counts say all.
+    """
+
+    counts: np.ndarray
+    given_ends: tuple[Share, Share] | None = None
+
+    @staticmethod
+    def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
+        """Return the law by counts over packets of which the last `order` fates are known.
+
+        Between ends that arrived for being ends the chain is one given its end. For order 1 the counts are then such
+        that their shares are the maximum of that likelihood, with as many packets as know as much, and intervals are
+        by its profile; for higher orders packets between the ends are counted.
+
+        Raises:
+            ValueError: what is no fates, or an order that is not from 1 to 12.
+        """
+        if check_count("order", order) > 12:
+            raise fail("order", "at most 12 packets back", order)
+        counts = np.zeros((2**order, 2))
+        stretches = check_fates(fates)
+        for stretch in stretches:
+            past, length = _number_last_fates(fill_ends(stretch), order)
+            # Of order 1 the chain is taken given its end, so that the step to the end counts as well. A past that comes
+            # several times is counted each time.
+            counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
+            np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
+        spans = _measure_spans(stretches)
+        return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
+
+    @property
+    def order(self) -> int:
+        """Number of packets back on which the probability depends."""
+        return len(self.counts).bit_length() - 1
+
+    def shares(self) -> dict[str, Share]:
+        """Return P(lost | arrived) as "fail" and P(arrived | lost) as "recover" with Wilson's intervals.
+
+        Of a higher order P(lost | past) of each past. Between ends that were chosen for arriving the intervals are the
+        likelihood's.
+        """
+        if self.given_ends is not None:
+            return dict(zip(("fail", "recover"), self.given_ends, strict=True))
+        if self.order == 1:
+            (stayed, failed), (recovered, lost) = self.counts
+            return {"fail": wilson(failed, stayed + failed), "recover": wilson(recovered, recovered + lost)}
+        names = [f"loss_after_{past:0{self.order}b}" for past in range(len(self.counts))]
+        return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """Return the probability (k + 1/2) / (n + 1) of each loss: k losses of n packets had the same past.
+
+        The past are the last fates, at most `order`, as many as are known without a gap.
+        """
+        past, length = _number_last_fates(fate, self.order)
+        probabilities = np.zeros(len(fate))
+        for known in range(self.order + 1):
+            # (arrived, lost) after the last `known` fates (2^known, 2), summed over fates further back.
+            counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)
+            p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
+            selected = length == known
+            probabilities[selected] = p[past[selected] & (2**known - 1)]
+        return probabilities
+
+    def _compute_return_probability(self, steps: int) -> float:
+        """Return P(arrived after so many steps | arrived now), whatever became of the packets between.
+
+        Of order 1 in closed form, (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived), b = P(arrived |
+        lost).
+        """
+        if self.order > 1:
+            return super()._compute_return_probability(steps)
+        a, b = self.predicted(np.array([0.0, np.nan]))[1], 1 - self.predicted(np.array([1.0, np.nan]))[1]
+        return float((b + a * (1 - a - b) ** steps) / (a + b))
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds."""
+        arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
+        if self.order == 1:
+            shares = self.shares()
+            return gilbert_elliott(arrives, lost, shares["fail"].estimate, shares["recover"].estimate)
+        # P(lost | past) for each past, a number whose bits are the last fates, the latest one lowest.
+        total = self.counts.sum(axis=1)
+        p = np.where(total > 0, self.counts[:, 1], 0.5) / np.where(total > 0, total, 1.0)
+        # The next past has the new fate as its lowest bit, and drops the oldest.
+        pasts = np.arange(len(p))
+        transition = np.zeros((len(p), len(p)))
+        transition[pasts, (pasts << 1) & (len(p) - 1)] += 1 - p
+        transition[pasts, ((pasts << 1) | 1) & (len(p) - 1)] += p
+        return markov_fading([lost if past & 1 else arrives for past in pasts], MarkovChain(transition))
+
+
+def _measure_spans(parts: Fates) -> np.ndarray:
+    """Return the steps from the first to the last packet of each stretch that was chosen for its ends, (stretches,)."""
+    return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
+
+
+def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -> MarkovLosses:
+    """Return the Markov law of order 1 that is most likely if each stretch was chosen for ending with an arrival.
+
+    Its `counts` have the shares of the maximum, not those that were counted: after either fate as many packets as would
+    tell its share p as well if all were trials, n = 1 / (p (1 - p) Var(logit p)), at most those that were counted.
+
+    Args:
+        counts: (arrived, lost) after an arrival and after a loss (2, 2).
+        spans: steps from the first to the last packet of each such stretch (stretches,).
+        intervals: whether the intervals of the two probabilities are computed too.
+    """
+    likelihood = _LikelihoodBetweenEnds(counts, spans).evaluate
+    top, value = maximise_over_shares(likelihood, [logits(0.1, 0.5), logits(0.3, 0.3), logits(0.02, 0.9)])
+    # Variances of the logits: the diagonal of the Hessian's inverse, by central differences of the gradient. Over this
+    # width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
+    width = 1e-4
+    shifts = width * np.eye(2)
+    hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
+    variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
+    # The number of packets that tell as much, and their fates in these shares.
+    fail, recover = shares = 1 / (1 + np.exp(-top))
+    packets = np.clip(1 / np.maximum(variances * shares * (1 - shares), 1e-300), 0.0, counts.sum(axis=1))
+    equivalent = packets[:, None] * np.array([[1 - fail, fail], [recover, 1 - recover]])
+    share_of_fail, share_of_recover = estimate_shares(likelihood, top, value, intervals)
+    if not counts[1].any():  # without losses nothing tells how they end
+        share_of_recover = wilson(0, 0)
+    return MarkovLosses(np.asarray(equivalent), (share_of_fail, share_of_recover))
+
+
+class _LikelihoodBetweenEnds(NamedTuple):
+    """Log-likelihood of a Markov law of order 1 for stretches that were chosen for ending with an arrival.
+
+    Args:
+        counts: (arrived, lost) after an arrival and after a loss (2, 2).
+        spans: steps m from the first to the last packet of each stretch (stretches,).
+    """
+
+    counts: np.ndarray
+    spans: np.ndarray
+
+    def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return l = sum n log p - sum_spans log P_m, and its gradient (2,), at the logits x (2,) of (a, b).
+
+        a: P(lost | arrived before), b: P(arrived | lost before). P_m = (b + a (1 - a - b)^m) / (a + b): the probability
+        to arrive again after m steps. It is divided by since arriving at the end is why the stretch ends there.
+        """
+        a, b = shares = 1 / (1 + np.exp(-x))
+        # P_m = again / total, with power = (1 - a - b)^m, whose derivative in a, and in b, is `slope`.
+        kept = 1 - a - b
+        power, slope = kept**self.spans, -self.spans * kept ** (self.spans - 1.0)
+        again, total = b + a * power, a + b
+        by_a = (power + a * slope) / again - 1 / total  # d log P_m / da
+        by_b = (1 + a * slope) / again - 1 / total  # d log P_m / db
+        (stayed, failed), (recovered, lost) = self.counts
+        value = stayed * np.log1p(-a) + failed * np.log(a) + recovered * np.log(b) + lost * np.log1p(-b)
+        score = np.array([failed / a - stayed / (1 - a) - by_a.sum(), recovered / b - lost / (1 - b) - by_b.sum()])
+        # By the logits: dp / d logit p = p (1 - p).
+        return float(value - np.sum(np.log(again / total))), score * shares * (1 - shares)
+
+
+def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last fates before each packet as a number, and how many are known without a gap, (packets,) each.
+
+    The number's lowest bit is the latest fate, 1 for lost; it has as many bits as are known, `order` at most.
+    """
+    number = np.zeros(len(fate), dtype=int)
+    length = np.zeros(len(fate), dtype=int)  # how many of the last fates are known
+    for back in range(1, order + 1):
+        # The fate `back` packets ago counts where all later ones are known too.
+        earlier = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]
+        is_unbroken = (length == back - 1) & ~np.isnan(earlier)
+        number += np.where(is_unbroken, np.nan_to_num(earlier).astype(int) << (back - 1), 0)
+        length += is_unbroken
+    return number, length

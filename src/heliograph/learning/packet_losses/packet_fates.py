@@ -1,0 +1,275 @@
+"""Fates of packets, 0 arrived, 1 lost, NaN unknown, in stretches between which nothing is known.
+
+A stretch that was chosen to begin and end with an arrival, as between the first and the last sequence number that came,
+has ends that are no trials: they arrived since otherwise the stretch would have other ends.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from heliograph.numerics.check import array, check_count, fail, items, rank, table
+from heliograph.numerics.types import ArrayLike, Bool, Float, Shaped
+
+Fates = list[Float[np.ndarray, " packets"]]
+
+
+class CheckedFates(Fates):
+    """Stretches as `check_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
+
+
+JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
+CHOSEN = 2.0  # of a packet that arrived, and is an end of its stretch for that reason
+COPY = 50  # a number received again may be a copy within so many
+FEW = 2  # numbers in a row that come again: more are those of a sender that restarted
+MOST = 2.0**53  # whole numbers up to here are doubles
+
+
+class BetweenArrivals(np.ndarray):
+    """Fates of a stretch that begins and ends where a packet arrived: these ends are no trials, being chosen for it.
+
+    Only the array itself is marked so; its slices, copies and sums are not.
+    """
+
+    chosen = False
+
+    def __array_finalize__(self, source: Any) -> None:
+        """Leave an array that is derived from another unmarked."""
+        self.chosen = False
+
+    @staticmethod
+    def of(fates: np.ndarray) -> "BetweenArrivals":
+        """Return fates (packets,) marked as those of a stretch that was chosen to begin and end with an arrival."""
+        marked = fates.view(BetweenArrivals)
+        marked.chosen = True
+        return marked
+
+
+def find_trials(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
+    """Return which packets are trials: those whose fate is known, and that are no ends chosen for having arrived."""
+    return np.asarray((fate == 0) | (fate == 1))
+
+
+def fill_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Return the fates with 0, arrived, for chosen ends: so packets after them know them."""
+    return np.where(fate == CHOSEN, 0.0, fate)
+
+
+def keep_ends_only(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Return the stretch with NaN, unknown, for all packets but the chosen ends, which arrived."""
+    return np.where(fate == CHOSEN, 0.0, np.nan)
+
+
+def fates_of_sequence(
+    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = JUMP
+) -> Fates:
+    """Return fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
+
+    A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted). Copies are dropped:
+    one or two numbers again within 50, or all again from a number on. Packets that overtake each other look like
+    restarts: with their times of sending they are put in order first, and a copy has number and time of another.
+
+    The first and the last packet of a stretch are its ends because they arrived: they are no trials (for `learn_losses`
+    and the laws of losses), though those between them are, given that both arrived.
+
+    Args:
+        sequence: sequence numbers in the order of arrival (packets,).
+        sent: times of sending (packets,), in any unit; none by default.
+        jump: leap ahead that means a restart; 200 by default.
+
+    Raises:
+        ValueError: no packet, numbers that are not whole, times of another length.
+    """
+    check_count("jump", jump, 2)
+    numbers = array("sequence numbers", sequence, (None,))
+    if not len(numbers) or np.any(numbers != np.round(numbers)):
+        raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
+    if np.max(np.abs(numbers)) > MOST:
+        raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
+    # In the order of sending where it is known: by time, then by number; equal pairs are copies, of which one stays.
+    ordered = numbers.astype(np.int64)
+    if sent is not None:
+        times = array("times of sending", sent, ordered.shape)
+        ordered = np.unique(np.stack([times, numbers]), axis=1)[1].astype(np.int64)
+    stretches = _split_at_restarts(ordered, jump, may_be_copies=sent is None)
+    return [_mark_gaps(np.array(stretch)) for stretch in stretches]
+
+
+def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> list[list[int]]:
+    """Return the sequence numbers (packets,) in rising stretches, each from one start of the sender to the next.
+
+    Args:
+        received: sequence numbers in order.
+        jump: leap ahead that means a restart.
+        may_be_copies: whether numbers that come again may be copies, which are dropped, and no restart.
+    """
+    stretches: list[list[int]] = [[]]
+    for run in _split_rising(received):
+        # Numbers at the begin of a rising run that are not above the last one.
+        again = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
+        if again and not (may_be_copies and _are_copies(again, run, stretches[-1])):
+            stretches.append([])
+            again = []
+        for number in run[len(again) :]:
+            if stretches[-1] and number - stretches[-1][-1] >= jump:
+                stretches.append([])
+            stretches[-1].append(number)
+    return [stretch for stretch in stretches if stretch]
+
+
+def _split_rising(received: np.ndarray) -> list[list[int]]:
+    """Return the numbers (packets,) in rising runs, cut where they fall back; of equal ones in a row one stays."""
+    numbers = received[np.concatenate([[True], np.diff(received) != 0])]
+    return [run.tolist() for run in np.split(numbers, np.flatnonzero(np.diff(numbers) < 0) + 1)]
+
+
+def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
+    """Return whether numbers that came again, at the begin of a rising run, are copies, and not of a restarted sender.
+
+    A few are, if all of them came within the last COPY. More are where all that came from a number on comes again, and
+    the run goes on from there, as from a broker that was not told of their arrival; but not from the first number on.
+    After 5, 6, 7, 8 come 7, 8, 9: `stretch` [5, 6, 7, 8] came before, `run` [7, 8, 9] rises from the break on, and
+    `again` [7, 8] are those of it that had come.
+    """
+    lately = stretch[-COPY:]
+    if not set(again) <= set(lately):
+        return False
+    replayed = len(run) > len(again) and again[0] != stretch[0] and stretch[-len(again) :] == again
+    return len(again) <= FEW or replayed
+
+
+def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
+    """Return the fates of all packets from the first received number to the last: the missing ones were lost.
+
+    `received`: rising sequence numbers.
+    """
+    fates = np.ones(received[-1] - received[0] + 1)
+    fates[received - received[0]] = 0.0
+    return BetweenArrivals.of(fates)
+
+
+def fates_by_node(
+    node: "Sequence[object] | Shaped[np.ndarray, ' packets']",
+    sequence: "Float[ArrayLike, ' packets']",
+    sent: "Float[ArrayLike, ' packets'] | None" = None,
+) -> dict[str, Fates]:
+    """Return {sender: fates of its packets} of the packets of a log, as `fates_of_sequence` finds them.
+
+    Args:
+        node: sender of each packet (packets,).
+        sequence: sequence numbers in the order of arrival (packets,).
+        sent: times of sending (packets,); none by default.
+
+    Raises:
+        ValueError: as `fates_of_sequence`; not one node for each number.
+    """
+    items("names of nodes", node, "names")
+    names = np.asarray([str(name) for name in node])
+    numbers = array("sequence numbers", sequence, (len(names),))
+    when = None if sent is None else array("times of sending", sent, (len(names),))
+    return {
+        str(name): fates_of_sequence(numbers[names == name], None if when is None else when[names == name])
+        for name in dict.fromkeys(names.tolist())
+    }
+
+
+def fates_by_hop(arrived: "Mapping[str, Float[ArrayLike, ' packets']]") -> dict[str, Fates]:
+    """Return {hop: fates (packets,)} of the packets of a route, by which of them arrived behind each of its hops.
+
+    A packet that was lost says nothing of the hops that it did not reach: its fate is NaN there.
+
+    Args:
+        arrived: {hop: (packets,)} in the order of the route, true or 1 where the packet arrived behind this hop.
+
+    Raises:
+        ValueError: no hops, other values, a packet that arrived behind a hop but not before it.
+    """
+    if not table("arrivals by hop", arrived, "arrays"):
+        raise fail("arrivals by hop", "at least one hop", "none")
+    by_hop: dict[str, Fates] = {}
+    reached: np.ndarray | None = None  # 1 of packets that passed the hop before; None at the first hop, all of them
+    for name, value in arrived.items():
+        passed = array(f"arrivals behind {name!r}", value, (None if reached is None else len(reached),))
+        if np.any((passed != 0) & (passed != 1)):
+            raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
+        reached = np.ones(len(passed)) if reached is None else reached
+        if np.any(passed > reached):
+            packet = int(np.argmax(passed > reached))
+            raise fail(
+                f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
+            )
+        # A packet has a fate at a hop if it reached it.
+        by_hop[name] = [np.where(reached == 1, 1.0 - passed, np.nan)]
+        reached = passed
+    return by_hop
+
+
+def fates_of_measurements(measurements: "Mapping[str, Float[ArrayLike, 'steps *received']]") -> dict[str, Fates]:
+    """Return the fates of what each node of a recording should have received at each step, where NaN is a loss.
+
+    Components of a node that come and go together are one packet, under the node's name; else each has a name of its
+    own, NODE.0, NODE.1, ... A component that never arrived was not sent.
+
+    Args:
+        measurements: {node: (steps, received)} or (steps,), NaN where a component did not arrive.
+
+    Raises:
+        ValueError: no table of numbers.
+    """
+    fates: dict[str, Fates] = {}
+    for node, value in table("measurements", measurements, "arrays").items():
+        name = f"measurements of {node!r}"
+        values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
+        lost = np.isnan(array(name, values[:, None] if values.ndim == 1 else values, (None, None), missing=True))
+        if np.all(lost == lost[:, :1]):
+            fates[node] = [lost[:, 0].astype(float)]
+        else:
+            fates |= {f"{node}.{i}": [column.astype(float)] for i, column in enumerate(lost.T) if not np.all(column)}
+    return fates
+
+
+def check_fates(value: object) -> Fates:
+    """Return fates, checked, as a list of stretches (packets,) without empty ones.
+
+    Ends that were chosen for having arrived (`BetweenArrivals`), and so are no trials, become CHOSEN.
+
+    Args:
+        value: one stretch of 0 (arrived), 1 (lost) and NaN (unknown), or a sequence of several.
+
+    Raises:
+        ValueError: anything but 0, 1 and NaN, or nothing that is known.
+    """
+    if isinstance(value, CheckedFates):
+        return value
+    stretches = _list_stretches(value)
+    parts = [array("fates", cast(ArrayLike, stretch), (None,), missing=True) for stretch in stretches]
+    for fate in parts:
+        if np.any((fate != 0) & (fate != 1) & ~np.isnan(fate)):
+            raise fail(
+                "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
+            )
+    chosen = [getattr(stretch, "chosen", False) for stretch in stretches]
+    fates = CheckedFates(
+        _mark_chosen_ends(fate) if is_chosen else fate
+        for fate, is_chosen in zip(parts, chosen, strict=True)
+        if len(fate)
+    )
+    if not any(np.any(find_trials(fate)) for fate in fates):
+        raise fail("fates", "at least one packet of which the fate is known and that is no end of its stretch", "none")
+    return fates
+
+
+def _list_stretches(value: object) -> list[Any]:
+    """Return the stretches of `value`: its members if all of them have one axis, else itself as the only one."""
+    is_sequence = isinstance(value, Sequence) or rank("fates", value) > 0
+    members: list[Any] = list(cast(Sequence[Any], value)) if is_sequence else [value]
+    are_stretches = len(members) > 0 and all(rank("fates", member) == 1 for member in members)
+    return members if are_stretches else [value]
+
+
+def _mark_chosen_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
+    """Return the fates (packets,) with CHOSEN for the first and the last."""
+    ends = np.zeros(len(fate), dtype=bool)
+    ends[[0, -1]] = True
+    return np.where(ends, CHOSEN, fate)

@@ -1,0 +1,121 @@
+"""Probabilities with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from scipy.optimize import brentq, minimize
+from scipy.special import expit, logit
+
+from heliograph.numerics.confidence_intervals import Share as Share
+
+FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
+# The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.
+FALL_AT_END = 2.995732
+END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
+FIRST_STEP = 0.25  # of a logit, from the maximum towards an end of an interval
+LOGIT_ACCURACY = 1e-3  # of an end
+PROFILE_ACCURACY = 1e-9  # relative, of a log-likelihood on a profile
+
+LogLikelihood = Callable[[np.ndarray], tuple[float, np.ndarray]]  # logits (p,) -> its value and gradient (p,)
+
+
+def maximise_over_shares(
+    function: LogLikelihood, starts: list[np.ndarray], precision: float = 1e-13
+) -> tuple[np.ndarray, float]:
+    """Return the highest point of a function of logits (p,), within END, by climbs from several starts; and its value.
+
+    precision: the relative change of the value at which a climb ends.
+    """
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = function(x)
+        return -value, -gradient
+
+    bounds = [(-END, END)] * len(starts[0])
+    results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
+    best = min(results, key=lambda end: float(end.fun))
+    return np.asarray(best.x), -float(best.fun)
+
+
+def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
+    """Return the shares at the maximum `top` (logits) of a log-likelihood, whose value there is `value`.
+
+    Each has the interval at whose ends its profile has fallen by FALL, or NaN in place of it unless `intervals`. A
+    share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
+    """
+    if not intervals:
+        return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
+    return [_find_profile_interval(function, top, value, i) for i in range(len(top))]
+
+
+def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
+    """Return share i at the maximum `top` (logits), with the interval at whose ends its profile has fallen by FALL.
+
+    `value`: the log-likelihood at the maximum.
+    """
+    # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
+    is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
+    level = value - (FALL_AT_END if is_zero or is_one else FALL)
+    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, -1)
+    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, 1)
+    estimate = float(expit(top[i]))
+    if is_zero or is_one:
+        estimate = 0.0 if is_zero else 1.0
+    return Share(estimate, low, high)
+
+
+def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: float, i: int, side: int) -> float:
+    """Return the share i at which its profile crosses a level, below (side -1) or above (1) the share of the maximum.
+
+    The profile at a logit is the log-likelihood, largest over all other logits. 0 or 1 is returned where it stays above
+    the level on that side.
+
+    Args:
+        function: log-likelihood of the logits and its gradient.
+        top: the logits of the maximum (p,).
+        level: log-likelihood to which the profile falls.
+        i: index of the share.
+        side: -1 or 1.
+    """
+    others = np.delete(np.arange(len(top)), i)
+    nearby = top[others]  # the other logits at the last point above the level: the next search begins there
+
+    @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
+    def height_above_level(logit_of_share: float) -> float:
+        """Return how far the profile at this logit is above the level."""
+        nonlocal nearby
+        best_others, profile = maximise_over_shares(
+            _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
+        )
+        if profile > level:
+            nearby = best_others
+        return profile - level
+
+    # The maximum itself, if it is below by rounding; an end of the domain, if the profile is above the level there.
+    inside, step = float(top[i]), FIRST_STEP
+    if height_above_level(inside) <= 0:
+        return float(expit(inside))
+    if height_above_level(side * END) >= 0:
+        return 0.0 if side < 0 else 1.0
+    # A bracket by doubled steps from the maximum, then Brent's method.
+    while height_above_level(outside := float(np.clip(inside + side * step, -END, END))) > 0:
+        inside, step = outside, 2 * step
+    return float(expit(brentq(height_above_level, inside, outside, xtol=LOGIT_ACCURACY)))
+
+
+def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray) -> LogLikelihood:
+    """Return the log-likelihood as a function of the `others` alone (indices of logits), where logit i is `fixed`."""
+
+    def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
+        x = np.zeros(len(free) + 1)
+        x[i], x[others] = fixed, free
+        value, gradient = function(x)
+        return value, gradient[others]
+
+    return function_of_others
+
+
+def logits(*shares: float) -> np.ndarray:
+    """Return the logits log(p / (1 - p)) of shares inside (0, 1), as an array."""
+    return np.asarray(logit(np.array(shares)))

@@ -1,0 +1,242 @@
+"""Networks with free numbers: a function that returns one, built again with others in the places of its marks."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cached_property
+from inspect import signature
+from typing import Any, Literal, Protocol, get_args
+
+import jax
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.learning.free_parameters import Parameter, Parameters, to_plain_number
+from heliograph.learning.likelihood.parameter_transforms import map_to_line
+from heliograph.numerics.check import (
+    COVARIANCE,
+    POSITIVE,
+    PROBABILITY,
+    REAL,
+    SIMPLEX,
+    Domain,
+    array,
+    error_text,
+    fail,
+    function,
+    instance,
+    mark_checked,
+    rank,
+    show_value,
+)
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.network import Network
+
+Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
+Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
+
+DOMAINS: dict[Kind, Domain] = {
+    "real": REAL,
+    "positive": POSITIVE,
+    "probability": PROBABILITY,
+    "simplex": SIMPLEX,
+    "covariance": COVARIANCE,
+}
+
+
+def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) -> Any:
+    """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
+
+    `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
+    that `hg.fit` calls. One name in several places is one number. Its place decides its domain: a variance and a scale
+    stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain, an
+    entry of a matrix, a number in a user's function may be any, unless `kind` says otherwise. Anywhere else than in a
+    fit it is its start.
+
+    Args:
+        start: value from which the search begins, () or of any shape; of kind "simplex" it sums to 1 over the last
+            axis.
+        name: name in the table of results; by default the number is called after its place.
+        kind: "real", "positive", "probability", "simplex" or "covariance"; decided by its place unless given.
+
+    Raises:
+        ValueError: a start that is no number, or an unknown kind.
+    """
+    if kind is not None and not (isinstance(kind, str) and kind in get_args(Kind)):
+        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", show_value(kind))
+    if name is not None and (not isinstance(name, str) or not name):
+        raise fail("name of a free number", "a text", show_value(name))
+    what = "free number" if name is None else name
+    value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
+    reader = _reader.get()
+    return (value if value.ndim else float(value)) if reader is None else reader.answer_free(value, name, kind)
+
+
+class _FreeNumberReader(Protocol):
+    """What answers the calls of `free` while a network is built."""
+
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return what stands in the place of the free number."""
+
+
+# What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
+_reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbers", default=None)
+
+
+@contextmanager
+def answer_free_marks_by(reader: _FreeNumberReader) -> Iterator[None]:
+    """Let `reader` answer all calls of `free` inside the block."""
+    token = _reader.set(reader)
+    try:
+        yield
+    finally:
+        _reader.reset(token)
+
+
+class _MarkedNumber:
+    """A free number while it is being collected: its start, name, and the domain that its places leave it."""
+
+    def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
+        self.start, self.given, self.place = start, name, ""
+        self.domain = None if kind is None else DOMAINS[kind]
+        self.explicit = kind is not None
+
+    def report(self, name: str, domain: Domain) -> None:
+        """Note the number's place, and narrow its domain to what the check there requires."""
+        self.place = self.place or name
+        if self.explicit:
+            return
+        known = REAL if self.domain is None else self.domain
+        if known.kind == domain.kind == "interval":
+            domain = Domain(low=max(known.low, domain.low), high=min(known.high, domain.high))
+        elif domain == REAL:
+            domain = known
+        self.domain = domain
+
+
+class FreeNumberCollector:
+    """Reader that collects the free numbers, each at its start; checks of their places report their domains."""
+
+    def __init__(self) -> None:
+        self.marks: list[_MarkedNumber] = []
+
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return the start, marked so that checks of its place report the domain."""
+        for mark in self.marks:
+            if name is not None and mark.given == name:
+                if not np.array_equal(mark.start, start):
+                    raise fail(
+                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
+                    )
+                return mark_checked(start, mark.report)
+        self.marks.append(_MarkedNumber(start, name, kind))
+        return mark_checked(start, self.marks[-1].report)
+
+    def parameters(self) -> Parameters:
+        """Return all free numbers that were marked as parameters; one without a name is called after its place."""
+        taken = {mark.given for mark in self.marks if mark.given is not None}
+        results = []
+        for mark in self.marks:
+            name = mark.given or _make_name_distinct(mark.place or "free number", taken)
+            taken.add(name)
+            domain = REAL if mark.domain is None else mark.domain
+            map_to_line(name, domain, mark.start)  # raises at a start outside of the domain
+            results.append(Parameter(name, mark.start, domain))
+        return Parameters(tuple(results))
+
+
+class ValueReader:
+    """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
+
+    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
+        self.values = values
+        self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
+
+    def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
+        """Return the value of this name, or of the next number without a name."""
+        key = next(self.unnamed, "") if name is None else name
+        if key not in self.values:
+            raise fail(
+                "network", "the same free numbers each time it is built", "another one" if name is None else name
+            )
+        return self.values[key]
+
+
+def _make_name_distinct(name: str, taken: set[str]) -> str:
+    """Return a name that is not `taken`: the name itself, or with the first free number behind it."""
+    if name not in taken:
+        return name
+    return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)
+
+
+@readable
+@dataclass(frozen=True)
+class Description:
+    """Network with free numbers, as the function that builds it and the numbers that are free in it.
+
+    Args:
+        build: the function, without arguments, that returns the network.
+        parameters: the free numbers in the order in which the network uses them.
+        named: which of their names the user gave.
+    """
+
+    build: Build
+    parameters: Parameters
+    named: tuple[bool, ...]
+
+    def at(self, values: Mapping[str, object]) -> Network:
+        """Return the network, built with these values of its free numbers, {name: value}.
+
+        Raises:
+            ValueError: operations on a free number that derivatives cannot pass, a function that returns no network.
+        """
+        with answer_free_marks_by(ValueReader(self.parameters, self.named, values)), jax.enable_x64(True):
+            try:
+                return require_network(self.build())
+            except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+                expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
+                got = f"one that is read: {error_text(error)}"
+                raise fail("network to be learned", expected, got) from error
+
+    @cached_property
+    def start(self) -> Network:
+        """Network with every free number at its start."""
+        return self.at({parameter.name: to_plain_number(parameter.start) for parameter in self.parameters.every})
+
+    def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
+        """Return the network, of plain numbers, at a point x (p,) of the line."""
+        return self.at(self.parameters.known(x))
+
+
+def describe(network: Build) -> Description:
+    """Return what is free in the network that a function returns: its numbers, and how to build it with others.
+
+    Args:
+        network: a function without arguments that returns a Network, with `hg.free(...)` in place of numbers.
+
+    Raises:
+        ValueError: no function, one that returns no network, or nothing free.
+    """
+    if isinstance(network, Network):
+        expected = "a function that returns it with hg.free(...) in it, so that it can be built with other numbers"
+        raise fail("network to be learned", expected, "a Network")
+    function("network to be learned", network, "nothing that returns a Network")
+    try:
+        signature(network).bind()
+    except (TypeError, ValueError) as error:
+        raise fail("network to be learned", "a function without arguments", str(error)) from None
+    collector = FreeNumberCollector()
+    with answer_free_marks_by(collector), jax.enable_x64(True):
+        require_network(network())
+    if not collector.marks:
+        raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
+    parameters = collector.parameters()
+    is_named = tuple(mark.given is not None for mark in collector.marks)
+    return Description(build=network, parameters=parameters, named=is_named)
+
+
+def require_network(network: object) -> Network:
+    """Return what a function returned; raise ValueError if it is no network."""
+    return instance("network to be learned", network, Network, "a function that returns a Network")

@@ -1,0 +1,199 @@
+"""Directions in which data do not identify the free numbers: by the rank of the information, put in words."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from heliograph.learning.free_parameters import Parameters
+from heliograph.numerics.types import Float
+
+SPANNED = 1e-12  # share of the largest singular value above which a direction is spanned
+NOTHING, WEAK = 1e-8, 1e-4  # eigenvalues of the information in units of each coordinate's own
+SAME = 1e-5  # of a direction at several points
+WHOLE = 1e-4  # how far an exponent may be from a whole number
+LARGEST = 4  # exponent that is put in words
+
+
+class ConfoundedNumbers(NamedTuple):
+    """Free numbers of which the data identify fewer combinations than there are numbers.
+
+    places: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
+    identified sums sum_i w_i v_i where no product is; what is identified besides is neither. fix: how many numbers have
+    to be known from elsewhere.
+
+    Shapes: exponents, weights (combinations, places).
+    """
+
+    places: tuple[int, ...]
+    exponents: Float[np.ndarray, "combinations places"]
+    weights: Float[np.ndarray, "combinations places"]
+    fix: int
+
+
+class InformationRank(NamedTuple):
+    """Rank of the information at a point: directions of which nothing is known, and those of which something is.
+
+    flat, rest: orthonormal directions of either kind, in columns, in units of each coordinate. unit: that unit,
+    1 / sqrt(I_ii). weakest: the least eigenvalue along `rest`.
+    Shapes: flat (p, k), rest (p, p - k), unit (p,).
+    """
+
+    flat: Float[np.ndarray, "p k"]
+    rest: Float[np.ndarray, "p r"]
+    unit: Float[np.ndarray, " p"]
+    weakest: float
+
+
+def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationRank:
+    """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
+
+    A direction is flat where the eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING. A coordinate of which nothing
+    is known is one by itself.
+    """
+    diagonal = np.diag(information)
+    known = diagonal > 0
+    unit = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
+    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    is_flat = values < NOTHING
+    weakest = float(values[~is_flat].min(initial=np.inf))
+    return InformationRank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
+
+
+def find_confounded(
+    parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[InformationRank]
+) -> list[ConfoundedNumbers]:
+    """Return the groups of coordinates that the data do not separate at any of the points, with what they identify.
+
+    Only points with the fewest flat directions count. The flat directions of coordinates x become those of the numbers
+    v themselves, and of log |v|: sums of v, or products, are identified where they do not change along these.
+
+    Args:
+        parameters: the free numbers.
+        points: points of the line (p,).
+        ranks: the rank of the information at each of them.
+    """
+    fewest = min(rank.flat.shape[1] for rank in ranks)
+    if not fewest:
+        return []
+    of_logs, of_numbers = [], []  # flat directions at each point, in columns
+    for x, rank in zip(points, ranks, strict=True):
+        if rank.flat.shape[1] == fewest:
+            slopes, log_slopes = _differentiate_coordinates(parameters, x)
+            of_logs.append(_orthonormalise(log_slopes[:, None] * rank.unit[:, None] * rank.flat))
+            of_numbers.append(_orthonormalise(slopes[:, None] * rank.unit[:, None] * rank.flat))
+    return [_make_confounded_numbers(group, of_logs, of_numbers) for group in _group_connected_coordinates(of_logs)]
+
+
+def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return dv/dx and d log|v|/dx (p,) of each coordinate that is a number v of the table, at x (p,); 1 of others."""
+    slopes, log = np.ones(len(x)), np.ones(len(x))
+    for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
+        if entry.coordinate is not None:
+            slopes[entry.coordinate] = row[entry.coordinate]
+            log[entry.coordinate] = row[entry.coordinate] / value if value else np.nan
+    return slopes, np.nan_to_num(log)
+
+
+def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis, in columns, of what the columns of `vectors` span."""
+    left, size, _ = np.linalg.svd(vectors, full_matrices=False)
+    return np.asarray(left[:, size > SPANNED * max(size.max(initial=0.0), 1e-300)])
+
+
+def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
+    """Return the groups of coordinates that a flat direction at any point connects.
+
+    `bases`: orthonormal flat directions at each point, in columns.
+    """
+    joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
+    count, labels = connected_components(joined, directed=False)
+    groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
+    return [group for group in groups if joined[group, group].any()]
+
+
+def _make_confounded_numbers(
+    group: tuple[int, ...], of_logs: list[np.ndarray], of_numbers: list[np.ndarray]
+) -> ConfoundedNumbers:
+    """Return a group, with what the data do identify: products of whole powers if those fit all points, else sums.
+
+    Args:
+        group: the coordinates.
+        of_logs: flat directions of the logarithms of numbers at each point, in columns.
+        of_numbers: flat directions of the numbers at each point, in columns.
+    """
+    places = list(group)
+    unknown = int(max(np.linalg.matrix_rank(basis[places], tol=SAME) for basis in of_logs))
+    no_rows = np.zeros((0, len(group)))
+    powers = _find_identified_combinations([basis[places] for basis in of_logs])
+    if len(powers):
+        # In each row the least exponent becomes 1.
+        powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
+        are_whole = np.all(np.abs(powers - np.round(powers)) < WHOLE)
+        if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
+            return ConfoundedNumbers(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
+    sums = _find_identified_combinations([basis[places] for basis in of_numbers])
+    return ConfoundedNumbers(group, exponents=no_rows, weights=sums, fix=unknown)
+
+
+def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
+    """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
+
+    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.
+    """
+    _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
+    rank = int(np.count_nonzero(size > SAME))
+    return _reduce_to_echelon(right[rank:])
+
+
+def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
+    """Return the reduced row echelon form of a matrix of independent rows, by Gauss-Jordan elimination.
+
+    The leading entry of each row is 1, and the only one of its column; entries below SAME become 0.
+    """
+    reduced, column = rows.copy(), 0
+    for row in range(len(reduced)):
+        # The pivot is the largest entry from this row on, in the next column that has one above zero.
+        while column < reduced.shape[1]:
+            pivot = row + int(np.argmax(np.abs(reduced[row:, column])))
+            if abs(reduced[pivot, column]) > SAME:
+                break
+            column += 1
+        else:  # no column is left: the rows from here on are 0
+            break
+        # Bring it to this row, make it 1, and eliminate its column from all other rows.
+        reduced[[row, pivot]] = reduced[[pivot, row]]
+        reduced[row] /= reduced[row, column]
+        for other in range(len(reduced)):
+            if other != row:
+                reduced[other] -= reduced[other, column] * reduced[row]
+        column += 1
+    reduced[np.abs(reduced) < SAME] = 0.0
+    return reduced
+
+
+def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
+    """Return the text of a product of powers, such as "a * b^2 / c"."""
+    above = [_format_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
+    below = [_format_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
+    top = " * ".join(above) or "1"
+    return " / ".join([top, *below])
+
+
+def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
+    """Return the text of a weighted sum, such as "a + 0.64 b"."""
+    text = ""
+    for name, weight in zip(names, weights, strict=True):
+        if weight:
+            sign = "-" if weight < 0 else "+"
+            if text:
+                text += f" {sign} "
+            elif weight < 0:
+                text = sign
+            text += name if abs(abs(weight) - 1) < SAME else f"{abs(weight):.4g} {name}"
+    return text
+
+
+def _format_power(name: str, exponent: float) -> str:
+    """Return the text of a power, such as "a", "a^2", "a^0.5"."""
+    return name if exponent == 1 else f"{name}^{exponent:g}"

@@ -1,0 +1,61 @@
+"""What users of a fleet should read once: remarks of filters on their states, and sensors that seem stuck."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant_state import PlantState
+from heliograph.live.sorted_rows import HeldRow
+
+
+class RemarkWatch:
+    """Watch for what filters say of their states, by the newest row of each plant.
+
+    A late event may make a row anew, so that what was said never happened; it is counted all the same, and what happens
+    in its place is not said again. `counts` has how often each filter's state has been spoken of, over all plants, by
+    node and filter.
+    """
+
+    def __init__(self, fleet: Fleet):
+        self._pool, self._steps = fleet.pool, fleet.program.step_rows
+        self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
+
+    def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
+        """Yield the name of a plant and a line for each filter that has something new to say."""
+        for plant in plants if self.counts else ():
+            for place, said in self._read_remarks(plant.rows.held[-1]).items():
+                new = said.times - plant.remarked.get(place, 0)
+                if new > 0:
+                    self.counts[place] += new
+                    plant.remarked[place] = said.times
+                    yield plant.name, f"{place[0]}/{place[1]}: {said.words}"
+
+    def note_said(self, plant: PlantState) -> None:
+        """Note that all remarks on a plant were made before it was stored, so that none is made again."""
+        plant.remarked = {place: said.times for place, said in self._read_remarks(plant.rows.held[-1]).items()}
+
+    def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
+        """Return the remark of each filter on its state after a row, by node and filter."""
+        if not self.counts:
+            return {}
+        return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
+
+
+class FleetRepeatWatch:
+    """Watch for outputs that repeat for longer than their noise allows; each is said once, of one plant."""
+
+    def __init__(self, fleet: Fleet):
+        self._watches, self._nodes = fleet.held_watches, fleet.network.nodes
+        self._said = set[tuple[str, int]]()  # node and output
+
+    def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
+        """Yield the name of a plant and a line for each output that repeats for too long for the first time."""
+        for plant in plants if self._watches else ():
+            for node, link in plant.links.items():
+                for output in [i for i, count in enumerate(link.repeats.found) if count]:
+                    if (node, output) not in self._said:
+                        self._said.add((node, output))
+                        name = self._nodes[node].received_names[output]
+                        said = self._watches[node].describe_stuck_output(output, name, link.repeats)
+                        yield plant.name, f"{node}: {said}"

@@ -1,0 +1,76 @@
+"""A row of a live plant as the start of forecasts: its filters' states, the inputs held there, its estimates."""
+
+import numpy as np
+
+from heliograph.filters.plausibility import Judgement
+from heliograph.live.fleet import Fleet
+from heliograph.live.network_step_program import NetworkProgram
+from heliograph.model.estimate import Estimate, JudgedEstimate, lower_unsound_claim
+from heliograph.model.forecast_origin import Origin
+from heliograph.model.over_time import first
+
+
+def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.ndarray) -> Origin:
+    """Return where forecasts from the row in a slot start, or from those in several; the pool stays as it is.
+
+    Args:
+        fleet: the plants, whose pool has the rows.
+        slot: of the row, or of each row.
+        time: of the row, or of each row (rows,), in steps or in the unit of dt.
+    """
+    pool, program = fleet.pool, fleet.program
+    row = pool.table[slot].copy()
+    held, several = row[..., pool.held], row.ndim > 1
+    # Among the inputs stands the time step, which is not known ahead.
+    inputs = held if program.dt is None else np.insert(held, program.dt, np.nan, axis=-1)
+    spacing = float("nan") if program.dt is not None else 1.0
+    step = row[..., pool.at.start].astype(int) + 1
+    return Origin(
+        model=program.network,
+        state=program.step_rows.state.tree(row[..., pool.state]),
+        step=step if several else int(step),
+        inputs=inputs,
+        time=time,
+        spacing=spacing,
+        estimates=estimates_by_name(program, row[..., pool.outputs]),
+        several=several,
+    )
+
+
+def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs)."""
+    n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
+    estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
+    for columns in program.filter_columns:
+        mean = outputs[..., columns.mean : columns.mean + n]
+        covariance = outputs[..., columns.covariance : columns.covariance + n * n].reshape(*outputs.shape[:-1], n, n)
+        modes = columns.probabilities(outputs)
+        estimate = Estimate(mean, covariance, columns.claim, modes, attitude=attitude)
+        estimates[columns.node][columns.filter] = lower_unsound_claim(estimate)
+    return estimates
+
+
+def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    """Return the estimates of a row by node and filter, each with what its filter made of what arrived there.
+
+    `outputs`: those of the row, (outputs,). A fusion that tests nothing itself has an estimate alone.
+    """
+    estimates = estimates_by_name(program, outputs)
+    for columns in program.filter_columns:
+        tested = columns.judgement or columns.tested  # columns of its squared distance and count
+        if tested is None:  # it judges nothing: its estimate stands as it is
+            continue
+        estimate, nis = estimates[columns.node][columns.filter], float(outputs[tested.distance])
+        reason = 0.0 if columns.judgement is None else float(outputs[columns.judgement.reason])
+        estimates[columns.node][columns.filter] = JudgedEstimate(
+            mean=estimate.mean,
+            covariance=estimate.covariance,
+            claim=estimate.claim,
+            modes=estimate.modes,
+            attitude=estimate.attitude,
+            nis=nis,
+            received=int(outputs[tested.arrived]),
+            refused=Judgement.describe(reason, nis) if reason > 0 else "",
+            weight=None if columns.weighed is None else outputs[list(columns.weighed.weight)],
+        )
+    return estimates

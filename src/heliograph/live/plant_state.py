@@ -1,0 +1,361 @@
+"""State of one plant of a fleet: its rows, its time, and changes that can be undone.
+
+A leap is a jump in time that one clock alone has made so far (`clock_leap`); rows before the watermark, the newest
+confirmed arrival less the window, become final, and are never stepped again.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from math import inf
+from typing import NamedTuple, TypeAlias
+
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
+from heliograph.live.event import INPUTS, CheckedEvent
+from heliograph.live.link_counts import LinkCounts
+from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
+
+
+class WithdrawnEvent(NamedTuple):
+    """An event that was used until a later one showed that its clock is wrong."""
+
+    node_index: int
+    sequence: int
+    time: float
+
+
+# A row that took an event, with its numbers and events before; None if the row is new.
+Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
+
+
+class RowBeforeLeap(NamedTuple):
+    """The newest row before a leap in time, and the newest arrival before it."""
+
+    row: HeldRow
+    now: float
+
+
+class RowsOfLeap(NamedTuple):
+    """What taking back a leap removed from a plant, so that `PlantState.undo_changes` can restore it.
+
+    Attributes:
+        held: all rows held before.
+        kept: `PlantState.kept` before.
+        changes: how many changes had been recorded.
+        gone: rows that are not held any more.
+        rows: those of them whose estimates were not final.
+    """
+
+    held: list[HeldRow]
+    kept: RowBeforeLeap | None
+    changes: int
+    gone: list[HeldRow]
+    rows: list[HeldRow]
+
+
+@dataclass
+class PlantState:
+    """State of one plant: its rows, of which those from `dirty` on have to be stepped again.
+
+    Attributes:
+        name: name of the plant.
+        rows: the rows held, in order of time.
+        now: time of the newest arrival.
+        origin: date from which times are counted; None if times are numbers.
+        version: number of commits.
+        dirty: index of the first row to step again; None if all are up to date.
+        forced: number of rows that became final early, for lack of room.
+        links: counts of the messages, by node.
+        changes: changes since the last finalisation, for `undo_changes`.
+        leap: a leap in time that no other clock has confirmed; None if there is none.
+        silence: row of the newest step at which nothing came, which is no row of the history; None if there is none.
+        kept: row before a leap, after which all rows held are; None where that is among them, or there is no leap.
+        aside: what was taken back since the last finalisation, for `undo_changes`.
+        remarked: how often each filter's remark was said, by node and filter.
+        begun: time of the message with which it began, from which on a node may be silent.
+    """
+
+    name: str
+    rows: SortedRows
+    now: float
+    origin: datetime | None = None
+    version: int = 0
+    dirty: int | None = None
+    forced: int = 0
+    links: dict[str, LinkCounts] = field(default_factory=dict)
+    changes: list[Change] = field(default_factory=list)
+    leap: ClockLeap | None = None
+    silence: HeldRow | None = None
+    kept: RowBeforeLeap | None = None
+    aside: list[RowsOfLeap] = field(default_factory=list)
+    remarked: dict[tuple[str, str], int] = field(default_factory=dict)
+    begun: float = 0.0
+
+    @property
+    def confirmed(self) -> float:
+        """Return the newest arrival that another clock confirms, or that is believed; rows become final by it."""
+        return self.now if self.leap is None or self.leap.believed else self.leap.now
+
+    @property
+    def clock(self) -> tuple[float, ClockLeap | None]:
+        """Return the newest arrival, and the leap in time that led to it where no other clock confirms it."""
+        return self.now, self.leap
+
+    @clock.setter
+    def clock(self, clock: tuple[float, ClockLeap | None]) -> None:
+        """Set the newest arrival and the leap to what they were."""
+        self.now, self.leap = clock
+
+    def undo_contradicted_leap(
+        self, clock: str, time: float, longest_gap: float, agreed: bool, names: Sequence[str]
+    ) -> None:
+        """Take back a leap that is contradicted by what a clock says.
+
+        Args:
+            clock: name of the node that says so, or `ARRIVAL`.
+            time: what it says.
+            longest_gap: longest gap in time that is no leap.
+            agreed: whether another clock says the same.
+            names: names of the nodes in their order, then that of the inputs.
+        """
+        found = find_contradicted_leap(self.leap, self.now, time, longest_gap)
+        if self.leap is None or found is None:
+            return
+        leap, newest = found
+        if agreed or leap.is_taken_back_by(clock, time, newest):
+            self.undo_leap(leap, longest_gap, names)
+        elif clock == leap.clock:
+            self.leap = self.leap.with_back(leap, time)
+
+    def pass_time(self, clock: str, time: float, now: float, longest_gap: float, agreed: bool) -> None:
+        """Advance the time to `now` by an event that was used.
+
+        More than `longest_gap` at once is a leap, unless another clock agrees.
+
+        Args:
+            clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
+            time: what that clock says.
+            now: its arrival.
+            longest_gap: longest gap that needs no other clock.
+            agreed: whether another clock says the same.
+        """
+        leap, newest = self.leap, self.now
+        if agreed:
+            leap = None
+        elif leap is not None:
+            # From before the leap, an event says nothing of the present; one of the leap's own message neither.
+            if time < leap.time - longest_gap or (time == leap.time and clock == leap.clock):
+                return
+            leap = self._confirm_leap(clock, leap, time, longest_gap)
+        # A new leap, unless one is open still that nothing has confirmed: this event then is of its far side.
+        if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
+            moments = {node: (link.at, link.latest) for node, link in self.links.items()}
+            leap = ClockLeap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
+        self.now, self.leap = max(newest, now), leap
+
+    def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
+        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed."""
+        if clock != leap.clock:
+            return None
+        if leap.is_over(self.now):
+            return leap.earlier
+        others = (link.latest for node, link in self.links.items() if node not in (clock, INPUTS))
+        # A second message by the same clock: believed, unless another node was heard shortly before, which can confirm.
+        if clock != ARRIVAL and any(latest >= max(leap.now - longest_gap, 0.0) for latest in others):
+            return leap
+        return leap.as_believed()
+
+    def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
+        """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
+
+        Returns False, and changes nothing, if the row before it is not known any more.
+
+        Args:
+            leap: the leap, or one that it follows.
+            longest_gap: longest gap that is no leap: rows from so long before its far side on are of the leap.
+            names: those of the nodes in their order, then that of the inputs.
+        """
+        held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
+        all_after = first_after == 0  # all rows held are of the leap: only the one kept from before it is left
+        if all_after and self.kept is None:
+            return False
+        # The first row held is the base, whose events are final: they stay counted as used.
+        not_final = held[max(first_after, 1) :]
+        self._count_withdrawn(not_final, leap, names)
+        gone = held[first_after:]
+        # What `undo_changes` needs to take this back.
+        self.aside.append(RowsOfLeap(held=held, kept=self.kept, changes=len(self.changes), gone=gone, rows=not_final))
+        if all_after and self.kept is not None:
+            self.rows.replace_rows([self.kept.row])  # the base again
+            self.kept = None
+        else:
+            self.rows.replace_rows(held[:first_after])
+        # Rows from `dirty` on were to be stepped again: nothing is to be done if all of them are gone.
+        if self.dirty is not None and self.dirty >= len(self.rows.held):
+            self.dirty = None
+        self.now, self.leap = leap.now, leap.earlier
+        return True
+
+    def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
+        """Count the events of rows that a leap made as withdrawn, by node; `names`: those of nodes, then inputs."""
+        counts: dict[str, int] = {}
+        for row in rows:
+            for node, _, _ in row.events:
+                counts[names[node]] = counts.get(names[node], 0) + 1
+        for name, count in counts.items():
+            self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
+
+    def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
+        """Return whether rows from before a leap are held, and `time` comes after the first of them."""
+        return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
+
+    def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
+        """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
+        leaps, self.aside = self.aside, []
+        events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
+        return events, [row.slot for leap in leaps for row in leap.gone]
+
+    def add_event(
+        self, event: CheckedEvent, key: Key, take_slot: Callable[[], int], width: int, losses: tuple[str, int] | None
+    ) -> None:
+        """Add an event to the row with its key, or to a new row; record the change for `undo_changes`.
+
+        Args:
+            event: the event.
+            key: key of its row.
+            take_slot: called for the slot of a new row.
+            width: how many numbers a row has before its time.
+            losses: name of the event's node and the column of the number of messages lost before it, where its running
+                count says this; else None.
+        """
+        index, row = self.rows.find_row(key)
+        if row is None:
+            row = HeldRow(key, take_slot(), width)
+            self.rows.keys.insert(index, key)
+            self.rows.held.insert(index, row)
+            change: Change = row, None
+        else:
+            change = row, (row.numbers.copy(), dict(row.events))
+        self.rows.write_event(row, event)
+        if losses is not None:
+            self._write_lost(index, row, event, *losses)
+        self.changes.append(change)  # last: that of the event itself
+        self.dirty = index if self.dirty is None else min(self.dirty, index)
+
+    def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
+        """Write how many messages were lost before an event, by the running count, unless the message says it itself.
+
+        That of the node's next event is written anew too, where there is one already.
+
+        Args:
+            index: index of the event's row.
+            row: this row.
+            event: the event.
+            node: name of its node.
+            column: column of the number in a row.
+        """
+        if row.numbers[column] == row.numbers[column]:  # not NaN: the message says it
+            return
+        newest = self.links[node].newest if node in self.links else -1
+        row.numbers[column], corrected = self.rows.count_lost(index, event, column, newest)
+        for later_row, number in corrected:
+            self.changes.append((later_row, (later_row.numbers.copy(), dict(later_row.events))))
+            later_row.numbers[column] = number
+
+    def undo_changes(self) -> list[int]:
+        """Undo the changes since the last finalisation; return the slots that are free again.
+
+        Rows that had been stepped since become dirty.
+        """
+        slots, keys = list[int](), [row.key for row, _ in self.changes]
+        # Newest first: what changed after each leap that was taken back, then this itself.
+        for leap in reversed(self.aside):
+            slots += self._undo_since(leap.changes)
+            self.rows.replace_rows(leap.held)
+            self.kept = leap.kept
+        slots += self._undo_since(0)
+        self.aside = []
+        # Step again from the first row that was changed, which is never the base.
+        index = max(min(map(self.rows.find_index, keys), default=len(self.rows.held)), 1)
+        self.dirty = index if index < len(self.rows.held) else None
+        return slots
+
+    def _undo_since(self, count: int) -> list[int]:
+        """Undo the changes after the first `count`, newest first; return the slots that are free again."""
+        slots = []
+        for row, before in reversed(self.changes[count:]):
+            if before is None:  # the row was new
+                self.rows.remove_row(self.rows.find_index(row.key))
+                slots.append(row.slot)
+            else:
+                row.numbers, row.events = before
+        del self.changes[count:]
+        return slots
+
+    def link_counts(self, node: str) -> LinkCounts:
+        """Return the counts of a node."""
+        link = self.links.get(node)
+        if link is None:
+            link = self.links[node] = LinkCounts()
+        return link
+
+    def take_dirty_rows(self) -> list[HeldRow]:
+        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none."""
+        chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
+        self.dirty = None
+        return chain
+
+    def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
+        """Make rows before the watermark final; return them and the slots that are no longer needed.
+
+        `longest_gap`: longest gap that is no leap; of the rows before a leap the newest is kept.
+        """
+        self.changes = []
+        base, forced = self.rows.find_base(watermark)
+        if not base:  # the base stays what it is: no row becomes final
+            return [], self._free_kept_row([], longest_gap)
+        self.forced += forced
+        final, left = self.rows.move_base(base)
+        return final, self._free_kept_row(left, longest_gap)
+
+    def _free_kept_row(self, left: list[HeldRow], longest_gap: float) -> list[int]:
+        """Keep the newest row before a leap, as long as the leap may be taken back; return the slots of all others.
+
+        `left`: rows that are not held any more.
+        """
+        # The oldest leap that is not confirmed, other than the one with which the plant began.
+        leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
+        leap = leaps[-1] if leaps else None
+        if self.kept is not None and (leap is None or leap.now != self.kept.now):  # it was of another leap
+            left, self.kept = [*left, self.kept.row], None
+        if leap is not None and self.kept is None:
+            before = [row for row in left if row.key[0] < leap.time - longest_gap]
+            if before and self.rows.held[0].key[0] >= leap.time - longest_gap:  # all rows held are after the leap
+                self.kept = RowBeforeLeap(before[-1], leap.now)
+                left = [row for row in left if row is not before[-1]]
+        return [row.slot for row in left]
+
+    @property
+    def slots(self) -> list[int]:
+        """Return all slots of the plant."""
+        kept = [] if self.kept is None else [self.kept.row]
+        gone = [row for leap in self.aside for row in leap.gone]
+        return [row.slot for row in (*self.rows.held, *kept, *gone)]
+
+
+class FinalisedPlant(NamedTuple):
+    """What `Fleet.finalise_plants` made final of one plant.
+
+    Attributes:
+        plant: the plant.
+        final: rows that are final now, in order of time.
+        newest: its newest row.
+        left: slots to free once the rows have been read.
+        withdrawn: events that had been used, of a clock that has turned out wrong.
+    """
+
+    plant: PlantState
+    final: list[HeldRow]
+    newest: HeldRow
+    left: list[int]
+    withdrawn: list[WithdrawnEvent]

@@ -1,0 +1,264 @@
+"""Allocation of bits to senders' words under a total rate, for the least steady error of the filter of all."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.model.words.encoder import Words
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.lapack import spectral_radius
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.law import Constant
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.words.bit_flips import Flips
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+MOST = 24  # bits of a word
+STEPS = 300  # of the relaxation
+
+
+@readable
+class BitsDesign(NamedTuple):
+    """Bits of each sender, the steady trace of the error with them, and a bound below that of any bits.
+
+    Args:
+        bits: by node; 0 of one that sends nothing.
+        error: trace of the steady covariance of the best linear filter of all words, with subtracted dither.
+        bound: that no bits of this total rate have less.
+        encoders: of the nodes that send, with these bits and a dither that is taken off.
+    """
+
+    bits: dict[str, int]
+    error: float
+    bound: float
+    encoders: dict[str, Words]
+
+
+class _PlantAndSenders(NamedTuple):
+    """Linear plant and its senders, each of which sends one output c_i x + v_i as a word of some bits.
+
+    transition, process: A and Q of the plant. rows: c_i of the sensors. information: [i, B] = j_i(B), what a word of B
+    bits says of c_i x, as the inverse of a noise variance, for B from 0 to MOST.
+    """
+
+    transition: Float[np.ndarray, "n n"]
+    process: Float[np.ndarray, "n n"]
+    rows: Float[np.ndarray, "senders n"]
+    information: Float[np.ndarray, "senders bits"]
+
+
+def design_bits(network: Network, total: int) -> BitsDesign:
+    """Return the bits of each sender's words, of `total` bits a step, for a small error of the filter of all nodes.
+
+    A word of B bits over a range of 2a, with D = 2a / (2^B - 1), U = D^2 (4^B - 1)/12 and flips of g = 1 - 2p, says as
+    much of y as one measurement of the information j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)). j is convex in B while
+    D^2/12 > R and concave then, so that one more bit may say little where three say much: bits are added greedily,
+    several at once, by the decrease of the error for each. The steady trace is convex in all j; with each j replaced by
+    its concave envelope the best real bits give the bound, by Frank and Wolfe's steps, whose linear part is exact. It
+    is close where steps are no coarser than the noises, and loose where a precise sensor has few bits.
+
+    Args:
+        network: nodes with encoders, whose ranges and links are kept, of one output each.
+        total: bits that all nodes together send at a step.
+
+    Raises:
+        ValueError: no network of senders of words with one output each behind constant error rates, a plant that is not
+            linear or not stable, no bit.
+
+    Source: Frank and Wolfe (1956), for the bound; the concave envelope of an S-shaped utility.
+    """
+    senders = _collect_plant_and_senders(instance("network", network, Network, "a Network"))
+    budget, names = check_count("total bits", total), list(network.names)
+    bits = _add_bits_greedily(senders, budget)
+    error = _compute_steady_error(senders, _information_of_bits(senders, bits))
+    nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
+    encoders = {
+        name: Words(int(count), node.encoder.low, node.encoder.high, "subtracted")
+        for name, node, count in zip(names, nodes, bits, strict=True)
+        if count and node.encoder is not None
+    }
+    return BitsDesign(
+        bits={name: int(count) for name, count in zip(names, bits, strict=True)},
+        error=error,
+        bound=min(_bound_by_relaxation(senders, budget), error),
+        encoders=encoders,
+    )
+
+
+def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
+    """Return plant, sensors and the information of their words of 0 to MOST bits, as arrays.
+
+    Raises:
+        ValueError: a plant that is not linear and stable; a node without an encoder, or with several outputs.
+    """
+    plant = network.plant
+    expected = "a stable LinearPlant without inputs, as words overload in the end of any other"
+    if not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise) or plant.inputs:
+        raise fail("plant of a design of bits", expected, type(plant).__name__)
+    a, q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
+    if spectral_radius(a) >= 1:
+        raise fail("plant of a design of bits", expected, f"one of spectral radius {spectral_radius(a):.3g}")
+    rows, information = list[np.ndarray](), list[np.ndarray]()
+    for name, node in network.nodes.items():
+        if not isinstance(node, Node) or node.encoder is None or len(node.outputs) != 1:
+            raise fail(f"node {name!r} of a design of bits", "one with an encoder and one output", "another")
+        if not isinstance(node.sensor, LinearSensor):
+            raise fail(f"sensor of node {name!r} of a design of bits", "a LinearSensor", type(node.sensor).__name__)
+        rows.append(np.asarray(node.sensor.matrix)[0])
+        encoder_range = float(np.max(node.encoder.high) - np.min(node.encoder.low))
+        variance = float(np.asarray(node.sensor.noise.covariance)[0, 0])
+        information.append(_compute_word_information(variance, encoder_range, _find_bit_gain(name, node)))
+    return _PlantAndSenders(transition=a, process=q, rows=np.array(rows), information=np.array(information))
+
+
+def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
+    """Return the information j(B) of words of B = 0 to MOST bits about the value that was measured.
+
+    j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)) with the step D = range / (2^B - 1) and U = D^2 (4^B - 1)/12, the variance
+    of uniform words; 0 of no bits.
+
+    Args:
+        variance: R, of the sensor's noise.
+        encoder_range: of the values that the words cover.
+        gain: g = 1 - 2p of each bit, where p is the probability that it is flipped.
+    """
+    counts = np.arange(1, MOST + 1)
+    step = encoder_range / (2.0**counts - 1)
+    noise = variance + step**2 / 12 * (1 + (4.0**counts - 1) * (1 / gain**2 - 1))
+    return np.concatenate([[0.0], 1 / noise])
+
+
+def _find_bit_gain(name: str, node: Node) -> float:
+    """Return the gain g = 1 - 2p of a node's link for one bit, p its error rate; ValueError unless that is constant."""
+    link = node.channel
+    if isinstance(link, Flips) and isinstance(link.error, Constant):
+        return float(link.gain.moment(1))
+    if isinstance(link, GainAndNoise):  # a selection, as an encoder demands
+        return 1.0
+    raise fail(f"channel of node {name!r} of a design of bits", "decode_and_forward with constant rates, or perfect()",
+               type(link).__name__)  # fmt: skip
+
+
+def _information_of_bits(senders: _PlantAndSenders, bits: Sequence[int] | np.ndarray) -> Float[np.ndarray, " senders"]:
+    """Return the information j_i (senders,) of each sender's word of so many bits."""
+    found: np.ndarray = senders.information[np.arange(len(senders.rows)), np.asarray(bits)]
+    return found
+
+
+def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
+    """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
+    sends = j > 0
+    a, q, c = senders.transition, senders.process, senders.rows[sends]
+    if not sends.any():
+        open_loop: np.ndarray = solve_discrete_lyapunov(a, q)
+        return open_loop
+    noise = np.diag(1 / j[sends])
+    before = solve_discrete_are(a.T, c.T, q, noise)
+    gain = np.linalg.solve(c @ before @ c.T + noise, c @ before).T
+    after: np.ndarray = before - gain @ c @ before
+    symmetric: np.ndarray = (after + after.T) / 2
+    return symmetric
+
+
+def _compute_steady_error(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> float:
+    """Return the trace of the steady covariance after words of this information j."""
+    return float(np.trace(_compute_steady_covariance(senders, j)))
+
+
+def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, " senders"]:
+    """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
+
+    P is the covariance after the words and M = (I - K C) A = P X^-1 A moves the error of one step to the next, X being
+    the covariance before the words.
+    """
+    p = _compute_steady_covariance(senders, j)
+    before = senders.transition @ p @ senders.transition.T + senders.process
+    m = p @ np.linalg.pinv(before) @ senders.transition
+    y = solve_discrete_lyapunov(m.T, np.eye(len(m)))
+    # Row i of `rows @ p` is c_i' P, so that the sum is (c_i' P) Y (P c_i).
+    slopes: np.ndarray = -np.einsum("in,nk,im,mk->i", senders.rows @ p, y, senders.rows @ p, np.eye(len(p)))
+    return slopes
+
+
+def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarray, " senders"]:
+    """Return the bits of each sender, added where the error falls most for a bit, until `total` of them are spent.
+
+    Several may be added at once to one sender; fewer are spent where none lowers the error.
+    """
+    bits = np.zeros(len(senders.rows), dtype=int)
+    error = _compute_steady_error(senders, _information_of_bits(senders, bits))
+    while (left := total - bits.sum()) > 0:
+        # (decrease of the error for each bit, sender, bits added, error then): the first counts most.
+        best = (0.0, 0, 0, error)
+        for i in range(len(bits)):
+            for more in range(1, min(left, MOST - bits[i]) + 1):
+                tried = bits.copy()
+                tried[i] += more
+                lower = _compute_steady_error(senders, _information_of_bits(senders, tried))
+                best = max(best, ((error - lower) / more, i, more, lower))
+        decrease, sender, more, error = best
+        if decrease <= 0:
+            return bits
+        bits[sender] += more
+    return bits
+
+
+def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
+    """Return a lower bound of the error of any bits of this total: the least of real bits with concave information.
+
+    By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
+    nowhere above it, and its least value over all bits of this total is a bound.
+    """
+    hulls = [_find_envelope(values) for values in senders.information]
+    j, bound = np.zeros(len(hulls)), -np.inf
+    for k in range(STEPS):
+        slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
+        best = _spend_bits(hulls, -slopes, total)
+        gap = float(slopes @ (j - best))
+        bound = max(bound, error - gap)
+        j = j + 2 / (k + 2) * (best - j)
+    return bound
+
+
+def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
+    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as far as it rises."""
+    corners = [(0, float(values[0]))]
+    while corners[-1][0] < len(values) - 1:
+        # The next corner is the one to which the line rises most steeply.
+        start, low = corners[-1]
+        further = np.arange(start + 1, len(values))
+        rises = (values[further] - low) / (further - start)
+        if rises.max() <= 0:
+            break
+        bits = int(further[np.argmax(rises)])
+        corners.append((bits, float(values[bits])))
+    return corners
+
+
+def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
+    """Return the information j_i (senders,) of real bits, `total` in sum, that maximises sum_i worth_i j_i.
+
+    The steepest edges of the envelopes come first. `hulls`: corners (bits, j) of each sender's concave envelope,
+    between which j is linear.
+    """
+    edges = [  # (worth of a bit, sender, bits, information)
+        (worth[i] * (high - low) / (b - a), i, b - a, high - low)
+        for i, hull in enumerate(hulls)
+        for (a, low), (b, high) in pairwise(hull)
+    ]
+    j, left = np.zeros(len(hulls)), float(total)
+    for _, sender, bits, information in sorted(edges, reverse=True):
+        share = min(1.0, left / bits)
+        j[sender] += share * information
+        left -= share * bits
+        if left <= 0:
+            break
+    return j

@@ -1,0 +1,235 @@
+"""Designs compared: over total powers, over places, and after each change of the network by a sensor or a relay."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from typing_extensions import TypeAliasType
+
+from heliograph.model.channel import amplify_and_forward
+from heliograph.numerics.check import array, fail, function, instance
+from heliograph.numerics.module import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.planning.design_problem import DesignProblem, PowerDesign
+from heliograph.planning.network_design import design
+from heliograph.planning.transmitters import transmitter_names, visit_hops
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.hop import AbstractHop, GainAndNoise
+from heliograph.random_affine.laws.law import GivenMoments
+from heliograph.random_affine.moments.signal_path import SignalMoment
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+SPAN, POINTS = 10.0, 9  # of the totals that are tried about a design's: down and up by this factor, so many
+SITE_STARTS, CHANGE_STARTS = 8, 16  # descents at each place, and after each change: compared, not built
+
+Advance = TypeAliasType("Advance", Callable[[str], None])
+
+
+def _report_nothing(what: str) -> None:
+    """Do nothing with a word on what comes next: progress is not reported."""
+
+
+@readable
+class ErrorsOverPower(NamedTuple):
+    """Least errors at several total powers in rising order, and bounds below which no error is; shapes (points,).
+
+    No error is above that of less power: what less power reaches, more reaches too.
+    """
+
+    totals: Float[np.ndarray, "points"]
+    errors: Float[np.ndarray, "points"]
+    bounds: Float[np.ndarray, "points"]
+
+
+def error_over_power(
+    problem: DesignProblem, totals: Sequence[float], advance: Advance = _report_nothing
+) -> ErrorsOverPower:
+    """Return the least error at each of several total powers.
+
+    Args:
+        problem: the design problem; its other limits of power stay.
+        totals: total powers, shape (points,), positive.
+        advance: called with a word before each design (by default nothing is).
+
+    Returns:
+        totals in rising order, errors, and bounds below which no error is, each of shape (points,).
+
+    Raises:
+        ValueError: totals that are not positive, what `hg.design` refuses.
+    """
+    instance("problem", problem, DesignProblem, "a DesignProblem")
+    powers = np.unique(array("budgets of the front", totals, (None,)))
+    if not len(powers) or powers[0] <= 0:
+        raise fail("budgets of the front", "positive numbers", list(totals))
+    designs = []
+    for total in powers:
+        advance(f"the best for a power of {total:.4g}")
+        designs.append(design(problem.replace_total(float(total))))
+    # A design that was found for less power counts for more power too: the least error so far.
+    errors = np.minimum.accumulate([best.error for best in designs])
+    bounds = np.minimum([best.bound for best in designs], errors)
+    return ErrorsOverPower(totals=powers, errors=errors, bounds=bounds)
+
+
+def list_totals_about(total: float) -> list[float]:
+    """Return POINTS total powers on both sides of this one, from a SPANth of it to SPAN times it."""
+    return [float(power) for power in total * np.geomspace(1 / SPAN, SPAN, POINTS)]
+
+
+@readable
+class ErrorsOverSites(NamedTuple):
+    """Errors (len(y), len(x)) at places, and the best of them."""
+
+    x: Float[np.ndarray, "columns"]
+    y: Float[np.ndarray, "rows"]
+    errors: Float[np.ndarray, "rows columns"]
+
+    @property
+    def best(self) -> tuple[float, float, float]:
+        """Best place and its error: x, y, error."""
+        row, column = np.unravel_index(np.argmin(self.errors), self.errors.shape)
+        return float(self.x[column]), float(self.y[row]), float(self.errors[row, column])
+
+
+def error_over_sites(
+    best: "PowerDesign",
+    build: "Callable[[float, float], Network]",
+    x: "Float[ArrayLike, ' columns']",
+    y: "Float[ArrayLike, ' rows']",
+    advance: Advance = _report_nothing,
+) -> "ErrorsOverSites":
+    """Return the least error at a design's total power where its network stands at each of several places.
+
+    Args:
+        best: the design.
+        build: function that returns the network for a place (x, y).
+        x: places, shape (columns,).
+        y: places, shape (rows,).
+        advance: called with a word before each row (by default nothing is).
+
+    Returns:
+        x, y, the errors at all places, shape (rows, columns), and the best place.
+
+    Raises:
+        ValueError: a function that builds no network, what `hg.design` refuses.
+    """
+    instance("design", best, PowerDesign, "a PowerDesign")
+    function("network of a map", build, "x and y")
+    columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
+    # The design is made again at each place. A few starts are enough, since errors are only compared.
+    problem = best.problem.replace_total(best.total)
+    problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
+    errors = np.zeros((len(rows), len(columns)))
+    for row, north in enumerate(rows):
+        advance(f"the map at y = {north:.4g}")
+        for column, east in enumerate(columns):
+            network = build(float(east), float(north))
+            if not isinstance(network, Network):
+                raise fail("map", "a function of x and y that returns a Network", type(network).__name__)
+            errors[row, column] = design(replace(problem, network=network)).error
+    return ErrorsOverSites(x=columns, y=rows, errors=errors)
+
+
+@readable
+class ChangeWorth(NamedTuple):
+    """Worth of a change: the error (or the power, of a target error) of the design made again, and what that saves.
+
+    name: "one more a", "without a", "a relay halfway of a.hop1".
+    """
+
+    name: str
+    value: float
+    saved: float
+
+
+def worth_of_changes(
+    best: PowerDesign, exponent: float | None = None, advance: Advance = _report_nothing
+) -> list[ChangeWorth]:
+    """Return what each change of a design's network is worth: a sensor more, one less, a relay halfway of a hop.
+
+    The design is made again for each sensor added once more or left out, and for a relay in each hop.
+
+    A relay halfway makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
+    A change that a design refuses, such as a last sensor left out, is not listed.
+
+    Args:
+        best: the design of a network.
+        exponent: exponent of the path loss; relays are not tried without.
+        advance: called with a word before each design (by default nothing is).
+
+    Returns:
+        Changes by name, with the value of the design and what it saves, the most first.
+
+    Raises:
+        ValueError: a design of anything but a Network.
+    """
+    instance("design", best, PowerDesign, "a PowerDesign")
+    network = instance("network of the design", best.problem.network, Network, "a Network")
+    problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
+    worths = []
+    for name, changed in _list_changes(problem, network, exponent).items():
+        advance(name)
+        value = design(changed).certificate.value
+        worths.append(ChangeWorth(name=name, value=value, saved=best.certificate.value - value))
+    return sorted(worths, key=lambda change: -change.saved)
+
+
+def _list_changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
+    """Return {name of a change: the design problem of the changed network}.
+
+    Changes are each sensor once more, each left out, and if `exponent` (of the path loss) is given a relay in each hop.
+    """
+    senders = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    nodes = {name: Node(node.sensor, node.channel, {}) for name, node in senders.items()}  # without filters
+    free = None if problem.free is None else tuple(problem.free)  # names of transmitters or nodes; None: all are free
+
+    def with_nodes(nodes: dict[str, Node], free: tuple[str, ...] | None) -> DesignProblem:
+        return replace(problem, network=Network(network.plant, nodes), free=free)
+
+    problems = {}
+    for name, node in nodes.items():
+        # The sensor once more; it is free as the others are.
+        twin = f"{name} again"
+        with_twin = None if free is None else (*free, twin)
+        problems[f"one more {name}"] = with_nodes({**nodes, twin: node}, with_twin)
+        # The sensor left out, unless nothing is left or nothing is free then. With a target error it is not tried, as
+        # that is one of all sensors.
+        still_free = None if free is None else tuple(each for each in free if _find_node_of_transmitter(each) != name)
+        if len(nodes) > 1 and still_free != () and problem.target_error is None:
+            rest = {other: other_node for other, other_node in nodes.items() if other != name}
+            problems[f"without {name}"] = with_nodes(rest, still_free)
+        # A relay in each hop. It changes the numbers in the names of hops behind it, so that nodes are free as a whole.
+        if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
+            free_nodes = (
+                None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
+            )
+            for hop in transmitter_names(node.channel):
+                with_relay = Node(node.sensor, _insert_relay(node.channel, hop, exponent), {})
+                problems[f"a relay halfway of {name}.{hop}"] = with_nodes({**nodes, name: with_relay}, free_nodes)
+    return problems
+
+
+def _find_node_of_transmitter(transmitter: str) -> str:
+    """Return the name of a transmitter's node: "north" of "north.hop1"."""
+    return transmitter.partition(".")[0]
+
+
+def _insert_relay(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
+    """Return the channel in which a relay stands halfway of the hop of this name.
+
+    Power falls with distance^exponent: over half the distance E g^k grows by 2^(exponent k / 2). Both halves have the
+    noise of the whole hop.
+    """
+
+    def insert_into_hop(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractRandomAffine:
+        """Return the two halves of this hop, any other hop as it is."""
+        if hop_name != name or not isinstance(hop, GainAndNoise):
+            return hop
+        mean, square = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))
+        law = GivenMoments([mean, square])
+        onward = GainAndNoise(law, np.eye(hop.outputs), hop.noise)
+        return amplify_and_forward([GainAndNoise(law, hop.matrix, hop.noise), onward])
+
+    return visit_hops(channel, insert_into_hop)

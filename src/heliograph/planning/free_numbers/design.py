@@ -1,0 +1,160 @@
+"""Designs of networks that are functions of free numbers."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.types import Float
+from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.free_numbers.problem import Build, FreeNumberProblem, read_free_numbers
+from heliograph.planning.network_from_design import repeat_network
+from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
+from heliograph.planning.sequential_quadratic_programming import (
+    ACTIVE,
+    DescentProblem,
+    PowerAndErrorLimits,
+    ScaledProgramme,
+    Vector,
+    search_from_starts,
+)
+
+
+class LagrangeConditions(NamedTuple):
+    """Lagrange's conditions at a point: the value, what they leave of it, and a watt's worth.
+
+    residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
+    numbers' own size. worth: the error that one more watt takes away at each step of each transmitter.
+    """
+
+    value: float
+    residual: float
+    worth: Float[np.ndarray, "time hops"]
+
+
+def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
+    """Return the design of a network that is a function of free numbers: the best of several descents.
+
+    Raises:
+        ValueError: no start from which a budget or a target error is met, a network that does not fit the error.
+    """
+    starts, seed = check_count("starts", task.starts), check_seed("seed", task.seed)
+    problem = FreeNumberProblem(*read_free_numbers(build, task.free), task.criterion)
+    target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
+    if target == 0:
+        raise fail("target error", "a number above zero", "0")
+    # Numbers of which no network can be made are refused before any descent: at the start, and near their ends.
+    present = problem.solve_at(problem.numbers.start)
+    problem.check_ends()
+    # The best of descents from the start, and from points that are drawn.
+    limits = _make_limit_rows(_limit_all_powers(problem, task.budget), target)
+    draws = np.random.default_rng(seed)
+    points = [problem.numbers.start, *(problem.numbers.draw_start(draws) for _ in range(starts - 1))]
+    descent = problem.descent_problem()
+    best = search_from_starts(descent, limits, points)
+    if best is None:
+        raise _make_unmet_limits_error(descent, limits, points)
+    # The design, and what Lagrange's conditions say of it. The problem is not convex: there is no lower bound. With a
+    # target what was minimised is the power, else the error.
+    found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best)
+    network, error = problem.network(best), problem.criterion.compute_exact_error(found.covariances)
+    value, unit = (error, "error") if target is None else (conditions.value, "power")
+    certificate = Certificate(
+        convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
+    )
+    # A watt more at every step falls on one transmitter: the price is the largest worth, times the steps.
+    return PowerDesign(
+        problem=task,
+        powers=dict(zip(problem.names, found.powers.T, strict=True)),
+        error=error,
+        certificate=certificate,
+        present=problem.criterion.compute_exact_error(present.covariances),
+        covariance=found.covariances,
+        sensitivity=dict(zip(problem.names, (-conditions.worth.sum(axis=0)).tolist(), strict=True)),
+        price=float(np.max(conditions.worth, initial=0.0) * limits.steps),
+        numbers=problem.numbers.split_by_name(best),
+        realised=repeat_network(network) if task.criterion.period > 1 else network,
+    )
+
+
+def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits:
+    """Return the limits that a budget sets to the powers of all transmitters (steps, hops); none without a budget."""
+    steps, hops = problem.error.steps, len(problem.names)
+    if budget is None:
+        return make_unlimited(steps, hops)
+    limits = make_power_limits(make_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
+    if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
+        raise fail("budget", "limits above zero where numbers are free", "zero")
+    return limits
+
+
+def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErrorLimits:
+    """Return the finite limits of a budget, peaks too, as rows of all powers, and the target error (None without one).
+
+    Powers are no free numbers here, so that their peaks are limits like others.
+    """
+    rows, most = allowed.make_limit_rows()
+    peak = allowed.peak.ravel()
+    finite = np.isfinite(peak)
+    peak_rows = (np.eye(peak.size) / np.where(finite, peak, 1.0)[:, None])[finite]
+    return PowerAndErrorLimits(
+        rows=np.concatenate([peak_rows, rows]),
+        most=np.concatenate([np.ones(len(peak_rows)), most]),
+        target=target,
+        steps=len(allowed.peak),
+    )
+
+
+def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
+    """Return the error for limits that no start meets: it names the least error within them, or the least power.
+
+    `begin`: the starts that were tried. A programme's `size` is its value at its start, here the least that was found.
+    """
+    starts, sharpest = len(begin), problem.sharpnesses[-1]
+    # The target error may be what cannot be met: the least error within the limits of power.
+    if limits.target is not None:
+        no_target = limits._replace(target=None)
+        best = search_from_starts(problem, no_target, begin)
+        if best is not None:
+            error = ScaledProgramme(problem, no_target, sharpest, best).size
+            return fail(
+                "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
+            )
+    # Else it is the power: the least total without limits of it (a target of infinity makes the power the value).
+    no_limit = PowerAndErrorLimits(rows=limits.rows[:0], most=limits.most[:0], target=np.inf, steps=limits.steps)
+    best = search_from_starts(problem, no_limit, begin)
+    power = np.inf if best is None else ScaledProgramme(problem, no_limit, sharpest, best).size
+    expected = f"one that is met from some of {starts} starts (a total power of {power:.6g} is the least found)"
+    return fail("budget", expected, "none that is")
+
+
+def evaluate_lagrange_conditions(problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector) -> LagrangeConditions:
+    """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
+
+    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
+    """
+    # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
+    programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
+    value, gradient = programme.objective(z)
+    # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
+    reached = programme.limit_room(z) < ACTIVE
+    axes = np.eye(len(z))
+    at_low, at_high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
+    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
+    multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
+    if normals:
+        solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
+        multipliers[reached] = solution[: int(reached.sum())]
+    # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power.
+    worth = limits.rows.T @ multipliers[: len(limits.most)] * programme.size
+    if limits.target is not None:
+        # With a target the value is the mean power. A watt at one step costs 1 / steps of it, and what limits add
+        # (`worth`). Divided by the target's multiplier, power per error, that is the error that the watt takes away.
+        power_per_error = multipliers[-1] * programme.size / limits.target
+        worth = (worth + 1 / limits.steps) / power_per_error if power_per_error > 0 else np.zeros_like(worth)
+    return LagrangeConditions(
+        value=value * programme.size,
+        residual=residual / max(value, 1e-300),
+        worth=worth.reshape(limits.steps, -1),
+    )

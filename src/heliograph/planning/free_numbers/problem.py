@@ -1,0 +1,336 @@
+"""Error and powers of a network as functions of its free numbers, and their derivatives.
+
+The gradient of the error is the adjoint's at fixed gains (`mode_riccati`), pulled back by JAX through the moments of
+channels and through the powers. What JAX compiles is shared by all designs of the same network.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from inspect import signature
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.engine.choice import compile_on_call
+from heliograph.learning.parametric_network import Description, describe
+from heliograph.model.over_time import first
+from heliograph.numerics.check import InputError, array, fail, instance, items, table
+from heliograph.numerics.module import are_same
+from heliograph.numerics.types import Array, Float
+from heliograph.planning.error_objective import Criterion, Error
+from heliograph.planning.free_numbers.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
+from heliograph.planning.free_numbers.reception_by_mode import (
+    check_time_variation,
+    list_sources,
+    list_transmitters,
+    make_mode_system,
+    means_are_known,
+)
+from heliograph.planning.plant_moments import check_stable
+from heliograph.planning.sequential_quadratic_programming import DescentProblem, Evaluation
+from heliograph.simulation.network import Network
+
+Build = Callable[..., Network]
+Vector = Float[np.ndarray, "x"]
+
+YOUNG = "young"  # the scalars in the bound of an uncertain mean gain
+
+
+class FreeNumber(NamedTuple):
+    """A free number or array of them: its start, and its least and largest values, of its shape."""
+
+    start: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def young_scalars(steps: int) -> FreeNumber:
+    """Return the scalar of Young's inequality for each step, or a single one of the steady bound.
+
+    From 0.1, between 1e-6 and 1e3: beyond these one of the bound's factors 1 + b and 1 + 1 / b is a thousand or more.
+    """
+    shape = () if steps == 1 else (steps,)
+    return FreeNumber(start=np.full(shape, 0.1), low=np.full(shape, 1e-6), high=np.full(shape, 1e3))
+
+
+class FreeNumbers(NamedTuple):
+    """All free numbers as one vector."""
+
+    by_name: dict[str, FreeNumber]
+
+    @property
+    def start(self) -> Vector:
+        """Values of all free numbers at which a search starts."""
+        return np.concatenate([number.start.ravel() for number in self.by_name.values()])
+
+    @property
+    def low(self) -> Vector:
+        """Least values of all free numbers."""
+        return np.concatenate([number.low.ravel() for number in self.by_name.values()])
+
+    @property
+    def high(self) -> Vector:
+        """Largest values of all free numbers."""
+        return np.concatenate([number.high.ravel() for number in self.by_name.values()])
+
+    def split_by_name(self, x: Array) -> dict[str, Any]:
+        """Return {name: number in its shape} from the vector x of all free numbers."""
+        by_name, begin = {}, 0
+        for name, number in self.by_name.items():
+            by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
+            begin += number.start.size
+        return by_name
+
+    def draw_start(self, draws: np.random.Generator) -> Vector:
+        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first."""
+        between = np.isfinite(self.low) & np.isfinite(self.high)
+        within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
+        factor = np.exp(draws.normal(size=len(self.low)))
+        return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
+
+
+def make_free_numbers(free: object) -> FreeNumbers:
+    """Return the free numbers of {name: (start, low, high)}; a start may be an array, ends numbers or of its shape.
+
+    Raises:
+        ValueError: nothing free, ends that do not enclose the start.
+    """
+    numbers = {}
+    for name, value in table("free", free, "(start, low, high)").items():
+        parts = items(f"free number {name!r}", value, "(start, low, high)")
+        if len(parts) != 3:
+            raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
+        start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
+        low, high = (_read_range_end(name, end, start.shape) for end in parts[1:])
+        if not np.all((low <= start) & (start <= high)):
+            raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
+        numbers[name] = FreeNumber(start, low, high)
+    if YOUNG in numbers:
+        raise fail("free", f"names other than {YOUNG!r}, which stands for a scalar of the bound", YOUNG)
+    if not numbers:
+        raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
+    return FreeNumbers(numbers)
+
+
+def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a least or largest value, which may be infinite, of the start's shape."""
+    try:
+        value = np.broadcast_to(np.asarray(end, dtype=float), shape)
+    except (TypeError, ValueError):
+        raise fail(f"end of {name!r}", f"a number, or numbers of shape {shape}", repr(end)) from None
+    if np.any(np.isnan(value)):
+        raise fail(f"end of {name!r}", "numbers", "nan")
+    return value
+
+
+def read_free_numbers(build: Build, free: object) -> tuple[Build, FreeNumbers]:
+    """Return the function and its free numbers: {name: (start, low, high)}, or where None the marks `hg.free` in it.
+
+    Raises:
+        ValueError: arguments of the function that are not the free numbers, marks that are no intervals.
+    """
+    names = list(table("free", free, "(start, low, high)")) if free is not None else []
+    try:
+        signature(build).bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
+    if free is not None:
+        return build, make_free_numbers(free)
+    description = describe(build)
+    marks = {}
+    for mark in description.parameters.every:
+        if mark.domain.kind != "interval":
+            raise fail(f"free number {mark.name!r}", "one between two limits", f"a {mark.domain.kind}")
+        ends = (np.full(mark.start.shape, end) for end in (mark.domain.low, mark.domain.high))
+        marks[mark.name] = FreeNumber(np.asarray(mark.start), *ends)
+    return partial(_build_by_name, description), FreeNumbers(marks)
+
+
+def _build_by_name(description: Description, **values: object) -> Network:
+    """Return the network of a description with these values in place of its marks."""
+    return description.at(values)
+
+
+UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
+PROGRAMS = 16  # networks whose programs are cached
+LEAST_UNIT = 1e-12  # of a number whose range and start are less
+INSIDE = 1e-9  # of the way from an end to the start
+
+
+class ErrorAndPowerSlopes(NamedTuple):
+    """Derivatives of the error, and of what each transmitter sends at each step."""
+
+    error: Float[np.ndarray, "x"]
+    powers: Float[np.ndarray, "time hops x"]
+
+
+@dataclass(frozen=True, eq=False)
+class TracedNetwork:
+    """A function of numbers that returns a network, the error of it, and what the function returned at the start.
+
+    Equal ones share their programs. A function may read numbers that live outside of it; that these have changed is
+    seen by what it returns.
+    """
+
+    build: Build
+    numbers: FreeNumbers
+    error: Error
+    young: bool
+    start: Network
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TracedNetwork) and are_same(
+            (self.build, self.start, self._list_array_shapes()), (other.build, other.start, other._list_array_shapes())
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._list_array_shapes())
+
+    def _list_array_shapes(self) -> tuple[object, ...]:
+        """Return what the shapes of a program's arrays depend on."""
+        shapes = tuple((name, number.start.shape) for name, number in self.numbers.by_name.items())
+        return shapes, self.error.steps, self.error.horizon is None, self.young
+
+    def make_system(self, x: Array) -> ModeSystem:
+        """Return the system of the best linear filter where the free numbers have the values x (numbers,)."""
+        values = self.numbers.split_by_name(jnp.asarray(x))
+        young = values.pop(YOUNG) if self.young else None
+        try:
+            network = self.build(**values)
+        except UNTRACEABLE as error:
+            expected = "operations of jax.numpy on its numbers, and no choice by their values"
+            raise fail("network of free numbers", expected, type(error).__name__) from None
+        return make_mode_system(network, self.error, young)
+
+    def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
+        """Return the derivatives of error and powers by the numbers x, at the fixed X, K and L of the solution."""
+        system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
+        # Cotangents of the system: that of the error first, then a unit one for each power.
+        of_error, size = jax.grad(lagrangian)(system, solution), system.powers.size
+        unit = jnp.eye(size).reshape(size, *system.powers.shape)
+        of_powers = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape)), system)._replace(powers=unit)
+        cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
+        slopes = jax.vmap(pull_back)(cotangents)[0]
+        return ErrorAndPowerSlopes(error=slopes[0], powers=slopes[1:].reshape(*system.powers.shape, len(x)))
+
+
+@lru_cache(PROGRAMS)
+def compile_programs(
+    network: TracedNetwork,
+) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
+    """Return the compiled programs of a network's system and derivatives; equal networks share them."""
+    return compile_on_call(network.make_system), compile_on_call(network.differentiate_by_numbers)
+
+
+class EvaluatedPoint(NamedTuple):
+    """System, its solution and derivatives at a vector of numbers; the error is smoothed where it is an eigenvalue."""
+
+    system: ModeSystem
+    solution: ModeSolution
+    slopes: ErrorAndPowerSlopes
+    criterion: Criterion
+
+    @property
+    def covariances(self) -> Float[np.ndarray, "time n n"]:
+        """Error covariances after each step."""
+        return np.asarray(self.solution.parts.sum(axis=1))
+
+    @property
+    def error(self) -> float:
+        """Return the error that the search makes small, at these numbers."""
+        return self.criterion.smooth(self.covariances)[0]
+
+    @property
+    def powers(self) -> Float[np.ndarray, "time hops"]:
+        """Powers that the transmitters send."""
+        return np.asarray(self.system.powers)
+
+
+class FreeNumberProblem:
+    """A network that is a function of numbers, as a descent needs it; the last point is cached."""
+
+    def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
+        self.build, self.numbers, self.error, self.young = build, numbers, error, False
+        network = self.network(numbers.start)
+        check_time_variation(network, error)
+        sources = list_sources(network).items()
+        if not all(means_are_known(name, first(source.channel)) for name, source in sources):
+            self.young, self.numbers = True, FreeNumbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
+        self.names, self.criterion = list_transmitters(network), error.criterion(network.states)
+        self._system, self._slopes = compile_programs(TracedNetwork(build, self.numbers, error, self.young, network))
+        self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
+
+    def network(self, x: Vector) -> Network:
+        """Return the network at these numbers."""
+        named = self.numbers.split_by_name(x).items()
+        values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
+        with jax.enable_x64(True):
+            return instance("network of free numbers", self.build(**values), Network, "a Network")
+
+    def check_ends(self) -> None:
+        """Raise ValueError where a number near an end of its range, the others at their starts, makes no network.
+
+        An end itself may be one that is never reached, as a noise of variance zero.
+        """
+        starts = {name: number.start for name, number in self.numbers.by_name.items()}
+        for name, (start, low, high) in self.numbers.by_name.items():
+            for end in (low, high):
+                near = np.where(np.isfinite(end), end, start)
+                near = near + INSIDE * (start - near)
+                values = {**starts, name: near}
+                try:
+                    self.network(np.concatenate([value.ravel() for value in values.values()]))
+                except InputError as error:
+                    what = f"{' '.join(str(end).split())}, where: {error}"
+                    raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
+
+    def solve_at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
+        """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
+
+        Raises:
+            ValueError: an error that grows without limit, powers that do.
+        """
+        criterion = self.criterion if criterion is None else criterion
+        key = x.tobytes(), criterion.sharpness
+        if key not in self._last:
+            system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
+            if system.start is None:
+                # With Young's scalar b the system holds sqrt(1 + b) A; the plant itself has to be stable.
+                scale = np.sqrt(1 + np.ravel(self.numbers.split_by_name(x)[YOUNG])[0]) if self.young else 1.0
+                check_stable(system.transition[0] / scale)
+            solution = solve_riccati(system, criterion)
+            slopes = ErrorAndPowerSlopes(*(np.asarray(slope) for slope in self._slopes(np.asarray(x), solution)))
+            self._last = {key: EvaluatedPoint(system, solution, slopes, criterion)}
+        return self._last[key]
+
+    def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
+        """Return the error, powers and derivatives; None where the error or the powers grow without limit.
+
+        `sharpness`: q, with which tr(S^q)^(1/q) stands for the largest eigenvalue; None for the trace.
+        """
+        try:
+            point = self.solve_at(x, self.criterion._replace(sharpness=sharpness))
+        except ValueError:
+            return None
+        return Evaluation(
+            error=point.error,
+            error_slope=point.slopes.error,
+            powers=point.powers.ravel(),
+            power_slope=point.slopes.powers.reshape(-1, len(x)),
+        )
+
+    def descent_problem(self) -> DescentProblem:
+        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
+        low, high = self.numbers.low, self.numbers.high
+        unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
+        return DescentProblem(
+            low=low,
+            high=high,
+            unit=unit,
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.list_from_smoothest()],
+            evaluate=self.evaluate,
+            restore=lambda x: x,  # limits of powers are no limits of x: only a descent leads back
+        )

@@ -1,0 +1,396 @@
+"""Designs of the powers of independent paths: water filling, descents, and bounds that hold for all allocations."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Bool, Float, Int
+from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.error_objective import Criterion
+from heliograph.planning.multihop_paths.model import (
+    PathInformation,
+    Paths,
+    compute_error_covariances,
+    compute_path_information,
+    compute_path_sensitivities,
+)
+from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths, compute_envelope, split_paths
+from heliograph.planning.multihop_paths.water_filling import water_filling
+from heliograph.planning.power_budget import MET, PowerLimits, Powers
+from heliograph.planning.sequential_quadratic_programming import (
+    DescentProblem,
+    Evaluation,
+    PowerAndErrorLimits,
+    Vector,
+    search_from_starts,
+)
+
+UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
+REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
+FACTORS = 1e-12, 1e12  # by which a start is raised until it reaches a target
+BISECTIONS = 60
+
+Mask = Bool[np.ndarray, "time free"]
+
+
+class PathProblem(NamedTuple):
+    """Error of paths as a function of free powers (time, free), as a descent needs it.
+
+    path: number of the path of each free column. information: free powers -> j of each path and dj/dp of each column, j
+    being the information that a path carries at a step. limits: of the free powers. scale: size of the powers.
+    """
+
+    paths: Paths
+    criterion: Criterion
+    path: Int[np.ndarray, "free"]
+    information: Callable[[Powers], PathInformation]
+    limits: PowerLimits
+    scale: float
+
+    def covariances(self, powers: Powers) -> Float[np.ndarray, "time n n"]:
+        """Return the error covariance P after each step."""
+        return compute_error_covariances(self.paths, self.information(powers).information)
+
+    def compute_exact_error(self, powers: Powers) -> float:
+        """Return the error at these powers, without smoothing of an eigenvalue."""
+        return self.criterion.compute_exact_error(self.covariances(powers))
+
+    def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
+        """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
+
+        By one adjoint recursion, at the free powers p (time, free).
+        """
+        information, slope = self.information(powers)
+        p = compute_error_covariances(self.paths, information)
+        value, weights = self.criterion.smooth(p)
+        by_information = compute_path_sensitivities(self.paths, information, p, weights)[:, self.path]
+        return value, by_information, -by_information * slope
+
+    def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
+        """Return the error, powers and their derivatives at x, powers in one row, with this smoothing of the error."""
+        powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
+        sharp = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
+        value, _, gradient = sharp.sensitivity(powers)
+        return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
+
+    def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
+        """Return the problem whose error, linear in P, touches this one's from below at p, its value and gradient.
+
+        The gradient is by the powers p (time, free).
+        """
+        problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
+        value, _, gradient = problem.sensitivity(powers)
+        return problem, value, gradient
+
+    def lower_bound(self, powers: Powers) -> float:
+        """Return Frank and Wolfe's lower bound of a convex error within the limits, from its tangent at powers p.
+
+        It is f(p) + min over allowed q of grad f(p).(q - p).
+        """
+        _, value, gradient = self.make_support(powers)
+        return float(value + np.sum(gradient * (self.limits.find_best_powers(-gradient) - powers)))
+
+    def bound_least_total(self, powers: Powers, target: float) -> float:
+        """Return the least total power at which the tangent at p reaches the target: a convex error needs no less.
+
+        By bisection of the total power.
+        """
+        _, value, gradient = self.make_support(powers)
+        low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
+        for _ in range(100):
+            middle = (low + high) / 2
+            best = self.limits._replace(total=middle).find_best_powers(-gradient)
+            reached = value + np.sum(gradient * (best - powers))
+            low, high = (low, middle) if reached <= target else (middle, high)
+        return low
+
+    def solve_from_starts(self, starts: list[Powers], target: float | None = None) -> Powers | None:
+        """Return the best powers (time, free) of descents from these starts, or None where none reaches the target.
+
+        They are those of the least error, or with a target of the least total power that reaches it.
+        """
+        rows, most = self.limits.make_limit_rows()
+        peak = self.limits.peak
+        problem = DescentProblem(
+            low=np.zeros(peak.size),
+            high=peak.ravel(),
+            unit=np.full(peak.size, self.scale),
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.list_from_smoothest()],
+            evaluate=self.evaluate,
+            restore=lambda x: self.limits.clip_powers(x.reshape(peak.shape)).ravel(),
+        )
+        best = search_from_starts(
+            problem, PowerAndErrorLimits(rows, most, target, len(peak)), [start.ravel() for start in starts]
+        )
+        return None if best is None else np.maximum(best, 0.0).reshape(peak.shape)
+
+
+class PowerTask(NamedTuple):
+    """A problem in the free powers (time, free), which hops are free, what the others send, and starts of a search.
+
+    fixed: powers that all hops send at present, of which those of the free ones do not matter.
+    """
+
+    problem: PathProblem
+    free: Bool[np.ndarray, "hop"]
+    fixed: Float[np.ndarray, "time hop"]
+    starts: list[Powers]
+
+    @property
+    def convex(self) -> bool:
+        """True if no path has two free hops; then j is concave in its power, and the error convex."""
+        return is_convex(self.problem.path)
+
+    def whole_paths(self) -> SplitPaths:
+        """Return the paths as functions of the power that their free hops send together."""
+        return split_paths(self.problem.paths, self.free, self.fixed)
+
+    def relax_to_whole_paths(self) -> PathProblem:
+        """Return the convex problem in the power of whole paths, whose least error is a lower bound of this one's.
+
+        A path may send what its hops may together, and split it at its best; its information is replaced by the concave
+        envelope, which is nowhere below.
+        """
+        problem, limits = self.problem, self.problem.limits
+        steps, count = problem.paths.second.shape
+        # Limits of a path: the sums of its hops'.
+        peak, mean = np.zeros((steps, count)), np.zeros(count)
+        np.add.at(peak.T, problem.path, limits.peak.T)
+        np.add.at(mean, problem.path, limits.mean)
+        cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
+        envelope = compute_envelope(self.whole_paths(), cap)
+        return problem._replace(
+            path=np.arange(count),
+            information=lambda powers: PathInformation(*envelope.information(powers)),
+            limits=limits._replace(peak=peak, mean=mean),
+        )
+
+    def sum_by_path(self, powers: Powers) -> Float[np.ndarray, "time path"]:
+        """Return the power of the free hops of each path together (time, path), from theirs (time, free)."""
+        total = np.zeros(self.problem.paths.second.shape)
+        np.add.at(total.T, self.problem.path, powers.T)
+        return total
+
+
+def is_convex(path: Int[np.ndarray, "free"]) -> bool:
+    """Decide whether no two free hops are on the same path."""
+    return len(set(path.tolist())) == len(path)
+
+
+def make_power_task(
+    paths: Paths,
+    criterion: Criterion,
+    limits: PowerLimits,
+    free: Bool[np.ndarray, "hop"],
+    fixed: Float[np.ndarray, "time hop"],
+    starts: int,
+    seed: int,
+) -> PowerTask:
+    """Return the problem in the free powers, with starts that are even over some choices of the paths that send.
+
+    Args:
+        paths: the paths of all hops.
+        criterion: the error.
+        limits: of the free powers.
+        free: which hops are free.
+        fixed: what all hops send at present.
+        starts: number of starts, if there are as many choices.
+        seed: of the choices that are drawn.
+    """
+
+    def information(powers: Powers) -> PathInformation:
+        """Return the information of all paths and its slope by the free powers, the others being fixed."""
+        of_all_hops = fixed.copy()
+        of_all_hops[:, free] = powers
+        of_paths = compute_path_information(paths, of_all_hops)
+        return PathInformation(of_paths.information, of_paths.slope[:, free])
+
+    # Each start shares the total evenly over the hops of one mask.
+    total = limits.total if np.isfinite(limits.total) else _choose_total(limits, paths)
+    masks = choose_supports(paths.path[free], len(fixed), starts, seed)
+    even_powers = [limits._replace(total=total).find_even_powers(mask) for mask in masks]
+    # The scale of the powers: the largest limit, or power of the first start, that is finite; 1 if that is 0.
+    sizes = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(even_powers[0].max(initial=0.0))]
+    scale = max((size for size in sizes if np.isfinite(size)), default=1.0) or 1.0
+    problem = PathProblem(
+        paths=paths,
+        criterion=criterion,
+        path=paths.path[free],
+        information=information,
+        limits=limits,
+        scale=scale,
+    )
+    return PowerTask(problem=problem, free=free, fixed=fixed, starts=even_powers)
+
+
+def _choose_total(limits: PowerLimits, paths: Paths) -> float:
+    """Return the total power of starts where none is given: what peaks and means allow, or plenty.
+
+    Plenty is so much that the noise of a hop hardly counts, ten times the largest alpha.
+    """
+    largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
+    plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
+    return float(np.where(np.isfinite(largest), largest, plenty).sum())
+
+
+def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) -> list[Mask]:
+    """Return masks (steps, free) of the hops that send at a start: all, and then choices of the paths that send.
+
+    They are every choice if there are at most `starts`, else as many as are drawn. A convex problem has one minimum,
+    and one start. `path`: number of the path of each free hop.
+    """
+    whole = np.ones((steps, len(path)), dtype=bool)
+    if is_convex(path):
+        return [whole]
+    distinct, column = np.unique(path, return_inverse=True)
+    entries = steps * len(distinct)
+    if entries < 63 and 2**entries - 1 <= starts:
+        # Every choice but all and none, as the bits of a number.
+        choices: Iterator[np.ndarray] = (
+            np.array([(number >> i) & 1 for i in range(entries)], dtype=bool) for number in range(2**entries - 2, 0, -1)
+        )
+    else:
+        # Each path sends with a probability that is drawn too, so that few and many are tried.
+        draws = np.random.default_rng(seed)
+        choices = (draws.uniform(size=entries) < draws.uniform(0.1, 0.9) for _ in range(starts - 1))
+    return [whole, *(on.reshape(steps, len(distinct))[:, column] for on in choices if np.any(on))]
+
+
+def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
+    """Return the powers (time, free) of the least error within the limits of a task, and the certificate."""
+    problem, starts = task.problem, task.starts
+    # Water filling solves a convex problem of the trace but for rounding; the descent goes on from there. A criterion
+    # with a sharpness is an eigenvalue, not a trace.
+    if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
+        path_of_hop = SplitPaths(*(values[:, problem.path] for values in task.whole_paths()))
+        starts = [water_filling(problem.limits, problem.sensitivity, path_of_hop, starts[0])]
+    powers = problem.solve_from_starts(starts)
+    assert powers is not None  # the starts are within the limits
+    # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
+    value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
+    _, tangent_value, _ = problem.make_support(powers)
+    stationarity = max(tangent_value - bound, 0.0) / value
+    # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
+    if not task.convex:
+        relaxed = task.relax_to_whole_paths()
+        relaxed_powers = relaxed.solve_from_starts([task.sum_by_path(powers)])
+        bound = relaxed.lower_bound(task.sum_by_path(powers) if relaxed_powers is None else relaxed_powers)
+    return powers, Certificate(
+        convex=task.convex,
+        value=value,
+        bound=min(bound, value),
+        stationarity=stationarity,
+        starts=len(starts),
+        unit="error",
+    )
+
+
+def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Certificate]:
+    """Return the powers (time, free) of the least total that reaches the target error, and the certificate."""
+    _check_reachable(task, target)
+    # Searched without the limit of the total power, which is what becomes small; it is checked afterwards.
+    limits = task.problem.limits
+    unlimited = task._replace(problem=task.problem._replace(limits=limits._replace(total=np.inf)))
+    powers = _find_least_powers(unlimited.problem, task.starts, target)
+    if powers is None:
+        raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
+    total = float(powers.mean(axis=0).sum())
+    if total > limits.total * (1 + MET):
+        least = find_least_error_powers(task)[1].value
+        raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
+    # The least total with which the error's tangent at these powers reaches the target. A convex error needs no less.
+    bound = unlimited.problem.bound_least_total(powers, target)
+    stationarity = 1 - bound / total if total > 0 else 0.0
+    # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
+    if not task.convex:
+        relaxed, of_paths = unlimited.relax_to_whole_paths(), task.sum_by_path(powers)
+        relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
+        bound = relaxed.bound_least_total(of_paths if relaxed_powers is None else relaxed_powers, target)
+    fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
+    return powers, Certificate(
+        convex=task.convex,
+        value=total + fixed,
+        bound=min(bound, total) + fixed,
+        stationarity=max(stationarity, 0.0),
+        starts=len(task.starts),
+        unit="power",
+    )
+
+
+def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
+    """Return the powers of the least total that reaches a target, by descents from the starts; None where none does.
+
+    Each start is raised first until it reaches the target.
+    """
+    no_power = np.zeros_like(starts[0])
+    if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
+        return no_power
+    raised = [start for start in (_raise_powers(problem, start, target) for start in starts) if start is not None]
+    if not raised:
+        return None
+    scale = max(float(raised[0].mean(axis=0).sum()), np.finfo(float).tiny)
+    return problem._replace(scale=scale).solve_from_starts(raised, target)
+
+
+def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
+    """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None.
+
+    By bisection of the factor's logarithm.
+    """
+
+    def reaches(factor: float) -> bool:
+        return problem.criterion.smooth(problem.covariances(problem.limits.clip_powers(start * factor)))[0] <= target
+
+    low, high = FACTORS
+    if not reaches(high):
+        return None
+    for _ in range(BISECTIONS):
+        middle = np.sqrt(low * high)
+        low, high = (low, middle) if reaches(middle) else (middle, high)
+    return problem.limits.clip_powers(start * high)
+
+
+def _check_reachable(task: PowerTask, target: float) -> None:
+    """Raise ValueError where the target is not above the error that remains however much is sent."""
+    limits = task.problem.limits
+    bounded = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
+    # The most that each may send: up to its peak, or plenty, or its whole mean power in one step.
+    most = np.minimum(limits.peak, UNLIMITED * np.maximum(task.problem.paths.alpha[:, task.free], 1.0))
+    most = np.minimum(most, limits.mean * len(most))
+    left = task.problem.compute_exact_error(most)
+    if target <= left * (1 + REACHED):
+        what = "power at its limits" if bounded else "unlimited power"
+        raise fail("target error", f"more than {left:.6g}: {what} leaves {left:.6g}", f"{target:.6g}")
+
+
+def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, present: float) -> PowerDesign:
+    """Return the design of a task: the least error within its limits, or the least power that reaches a target.
+
+    Args:
+        problem: what was to be designed, for the result.
+        task: the search of the free powers.
+        target: the target error; None for the least error.
+        present: error of the network as it is.
+    """
+    powers, certificate = find_least_error_powers(task) if target is None else find_least_total_powers(task, target)
+    paths = task.problem.paths
+    of_all_hops = task.fixed.copy()
+    of_all_hops[:, task.free] = powers
+    # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
+    all_free = task.problem._replace(path=paths.path, information=lambda p: compute_path_information(paths, p))
+    _, _, gradient = all_free.sensitivity(of_all_hops)
+    return PowerDesign(
+        problem=problem,
+        powers=dict(zip(paths.names, of_all_hops.T, strict=True)),
+        error=task.problem.compute_exact_error(powers),
+        certificate=certificate,
+        present=present,
+        covariance=task.problem.covariances(powers),
+        sensitivity=dict(zip(paths.names, gradient.sum(axis=0).tolist(), strict=True)),
+        # A watt more at every step, sent at one step by one transmitter, is worth `steps` times a watt there.
+        price=float(np.max(-gradient[:, task.free] * len(gradient), initial=0.0)),
+        numbers={},
+        realised=None,
+    )

@@ -1,0 +1,208 @@
+"""Best split of a path's power over its hops, the information that it gives, and the envelope that bounds it.
+
+With the power P of a path split at its best, p_h(l) = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with sum P, it
+carries j(P) = 1 / (D - t), D = A prod (1 + alpha_h / p_h), A = s K, and dD/dP = -l D. With several hops j is S-shaped.
+The ray from zero touches it once, and behind that point it is concave:
+  j' P / j = P l D / (D - t) <= 1  if and only if  D (1 - P l) >= t, and the left side never decreases, since
+  e = -P l' / l >= 2 - max_h a_h and P l = sum_h a_h with a_h = alpha_h / (p_h + alpha_h), so that e - 2 + P l >= 0;
+  j'' <= 0  if and only if  2 P l D / (D - t) <= P l + e, and there the left side is at most 2, the right at least 2.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import array, fail, scalar
+from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.planning.multihop_paths.model import (
+    Paths,
+    PathValues,
+    Powers,
+    compute_path_kappas,
+    require_at_least,
+    share_of_signal,
+)
+
+NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
+BISECTIONS = 120  # of log l between ends: 2^-120 of their distance, 138, is far below its rounding
+ENDS = 1e-30, 1e30  # of l, times the largest alpha
+SETTLED = 1e-15  # relative change of log l at which Newton's steps end
+DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
+LARGEST = 1e100  # powers and noises, whose squares doubles hold
+
+Hops = Float[np.ndarray, "time path hops"]
+
+
+class PowerSplit(NamedTuple):
+    """Powers of the hops of each path, information j of the path, and dj/dP."""
+
+    powers: Hops
+    information: PathValues
+    slope: PathValues
+
+
+class SplitPaths(NamedTuple):
+    """Paths by the power P that their free hops send together.
+
+    full: A = s K over what hops of fixed power let pass; signal: t; alpha: of the free hops, zeros where a path has
+    fewer than another.
+    """
+
+    full: PathValues
+    signal: PathValues
+    alpha: Hops
+
+
+def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
+    """Return the paths by the power that their free hops send together; the others send the powers `fixed`."""
+    full = paths.second * compute_path_kappas(paths)
+    # alpha of the free hops of each path.
+    free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
+    alpha = np.zeros((*full.shape, max(1, max(len(hops) for hops in free_hops))))
+    for i, hops in enumerate(free_hops):
+        alpha[:, i, : len(hops)] = paths.alpha[:, hops]
+    # A hop of fixed power divides A by p / (p + alpha).
+    share = share_of_signal(fixed, paths.alpha)
+    for h in np.flatnonzero(~free):
+        i = paths.path[h]
+        full[:, i] = np.where(share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD), DEAD)
+    return SplitPaths(full=np.minimum(full, DEAD), signal=paths.signal, alpha=alpha)
+
+
+def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
+    """Return powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a chain least.
+
+    p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with the multiplier l that the sum sets. Plant, sensor and
+    fading do not matter. Two hops share in the ratio sqrt(alpha_1 (P + alpha_2)) to sqrt(alpha_2 (P + alpha_1)).
+
+    Args:
+        alpha: noise of each hop in units of sent power, Var m / E g^2, shape (H,). A hop without noise gets nothing.
+        total: the sum P of the powers.
+
+    Returns:
+        The powers, shape (H,).
+
+    Raises:
+        ValueError: a negative noise or total, no hops, noises or a total whose squares are no numbers.
+    """
+    noise, power = check_hop_noises(alpha), float(scalar("total power", total, 0.0))
+    if not np.any(noise):
+        return np.zeros(len(noise))
+    if power and not 1 / LARGEST <= power <= LARGEST:
+        raise fail("total power", f"0, or a number from {1 / LARGEST:g} to {LARGEST:g}", f"{power:g}")
+    unit = np.ones((1, 1))
+    return np.asarray(split_power_over_hops(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
+
+
+def check_hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
+    """Return the noises alpha of a chain's hops (H,), checked: not negative, and of a size whose square is a number."""
+    noise = require_at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
+    if not len(noise):
+        raise fail("alpha of hops", "at least one", "none")
+    if np.max(noise) > LARGEST:
+        raise fail("alpha of hops", f"numbers of at most {LARGEST:g}", f"{np.max(noise):g}")
+    return noise
+
+
+def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
+    """Return the split of each path's power over its free hops that is best, with the path's information and slope.
+
+    With the noise factor D = A prod_h (1 + alpha_h / p_h) of a path its information is j = 1 / (D - t). It is greatest
+    where the powers p_h are those of one Lagrange multiplier l, by which they sum to P; then dD/dP = -l D.
+
+    Args:
+        whole: A (`full`), t (`signal`) and alpha of the paths.
+        total: the power P of each path at each step (time, path).
+    """
+    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
+    hops = (alpha > 0).sum(axis=-1)  # number of a path's free hops with noise
+    # The powers p_h(l), (time, path, hop), of exactly this sum.
+    log_l = _find_multiplier(alpha, power)
+    p = _split_at_multiplier(alpha, log_l)[0]
+    reached = p.sum(axis=-1, keepdims=True)
+    p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
+    # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
+    ratio = share_of_signal(p, alpha).prod(axis=-1)
+    below = whole.full - whole.signal * ratio
+    sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
+    slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
+    # Without power a path tells nothing: with one hop its slope is 1 / (A alpha), with several 0.
+    slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
+    return PowerSplit(
+        powers=np.where(sends[..., None], p, 0.0),
+        information=np.where(sends, ratio / below, 0.0),
+        slope=np.where(hops == 0, 0.0, np.where(sends, slope, slope_at_zero)),
+    )
+
+
+def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
+    """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is its power.
+
+    By Newton's method for log sum_h p_h as a function of log l, from l = (sum_h root alpha_h / P)^2, which is exact for
+    much power. `power`: P > 0 (time, path, 1).
+    """
+    has_hops = (alpha > 0).any(axis=-1, keepdims=True)
+    log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
+    for _ in range(NEWTON_STEPS):
+        p, falls = _split_at_multiplier(alpha, log_l)
+        reached = p.sum(axis=-1, keepdims=True)
+        excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
+        step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
+        log_l = log_l + step
+        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
+            break
+    return log_l
+
+
+def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return p_h(l) of each hop (time, path, hop), and -d sum_h p_h / d log l of each path (time, path, 1).
+
+    p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l): the same as (root - alpha) / 2,
+    without
+    the difference, and so without cancellation.
+    """
+    inverse = np.exp(-log_l)
+    root = np.sqrt(alpha**2 + 4 * alpha * inverse)
+    denominator = root + alpha
+    p = np.divide(2 * alpha * inverse, denominator, out=np.zeros_like(denominator), where=denominator > 0)
+    falls = np.divide(alpha * inverse, root, out=np.zeros_like(root), where=root > 0)
+    return p, falls.sum(axis=-1, keepdims=True)
+
+
+class Envelope(NamedTuple):
+    """Concave envelope of j(P) on [0, cap]: a ray of this slope up to the power where it touches, then j itself."""
+
+    whole: SplitPaths
+    touch: PathValues
+    ray: PathValues
+
+    def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
+        """Return the envelope and its slope at these powers of the paths."""
+        exact = split_power_over_hops(self.whole, total)
+        on_ray = total < self.touch
+        return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)
+
+
+def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
+    """Return the concave envelope of each path's information j(P) over its power P on [0, cap], cap (time, path).
+
+    With several hops j is S-shaped, and the envelope begins with a ray from zero. The ray touches j where
+    D (1 - P l) = t: by bisection in log l, as the left side falls with l. D = A prod (1 + alpha_h / p_h(l)) and
+    P = sum_h p_h(l), the best split by the multiplier l.
+    """
+    alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
+    largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
+    low, high = (np.log(end / largest) for end in ENDS)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        p = _split_at_multiplier(alpha, middle[..., None])[0]
+        noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
+        left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
+        is_above = left_side >= whole.signal
+        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+    # The power where the ray touches, at most the cap, and its slope j(P) / P.
+    touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
+    touch = np.minimum(touch, cap)
+    at_touch = split_power_over_hops(whole, touch)
+    ray = np.divide(at_touch.information, touch, out=np.zeros_like(touch), where=touch > 0)
+    return Envelope(whole, touch, ray)

@@ -1,0 +1,152 @@
+"""Water filling: a fast start for powers of which each path has one, by the condition of the optimum.
+
+Where a path has one free hop it carries the information j = p / (a p + b), concave in its power p, and the error is a
+convex function of the powers. At the optimum w_i dj_i/dp_i is the same for all that send, w_i = -d error / d j_i. With
+the weights w fixed that is
+    p_i = [y sqrt(w_i b_i) - b_i]^+ / a_i
+with a water level y that the budget sets, exactly, since the powers are piecewise linear in it. The way from p to those
+powers leads down, for the linearised error is concave in p; how far to go the slopes at both ends say.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.types import Float
+from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
+from heliograph.planning.power_budget import PowerLimits, Powers
+
+CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
+STEPS = 500
+PATIENCE = 20  # iterations in a row that do not close the gap further
+TRIES = 12  # points on the way to other powers
+STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
+
+
+class ErrorSlopes(NamedTuple):
+    """Error at some powers, -d error / d j of each free hop's path, and d error / d p."""
+
+    error: float
+    weights: Powers
+    gradient: Powers
+
+
+def water_filling(
+    limits: PowerLimits,
+    sensitivity: Callable[[Powers], tuple[float, Powers, Powers]],
+    whole: SplitPaths,
+    start: Powers,
+) -> Powers:
+    """Return the powers (time, free) of the least error within limits, where each path has one free hop.
+
+    Each iteration finds the powers that fill to one water level, with the present derivatives of the error, and moves
+    on the way to them to a point of less error. It ends when the gap to a lower bound of the error closes, or has not
+    shrunk for PATIENCE iterations.
+
+    Args:
+        limits: of the powers.
+        sensitivity: powers -> error, -d error / d j of each free hop's path, d error / d p.
+        whole: the path of each free hop.
+        start: powers at which to begin.
+    """
+    # The information of each free hop's path is j = p / (a p + b) at the power p of that hop.
+    a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
+    b = whole.full * whole.alpha[..., 0]
+
+    def slopes_at(powers: Powers) -> ErrorSlopes:
+        return ErrorSlopes(*sensitivity(powers))
+
+    best = p = start
+    least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
+    slopes = slopes_at(p)
+    for _ in range(STEPS):
+        # The gap of Frank and Wolfe: how far the error's tangent at p falls within the limits. No powers gain more.
+        gap = float(np.sum(slopes.gradient * (p - limits.find_best_powers(-slopes.gradient))))
+        idle = 0 if gap < (1 - CLOSED) * least_gap else idle + 1
+        if gap < least_gap:
+            least_gap, best = gap, p
+        if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
+            break
+        filled = _fill_to_limits(limits, slopes.weights, a, b)
+        p, slopes = _search_line(slopes_at, p, slopes, filled - p)
+    return best
+
+
+def _search_line(
+    slopes_at: Callable[[Powers], ErrorSlopes], p: Powers, slopes: ErrorSlopes, way: Powers
+) -> tuple[Powers, ErrorSlopes]:
+    """Return a point of less error on the way from p to p + way, and its slopes.
+
+    It is the end of the way, or where the slopes at both ends say that the error is least. Where rounding hides the way
+    down it is half of it, by which the gap still shrinks. `slopes`: those at p.
+    """
+    slope = float(np.sum(slopes.gradient * way))
+    length = 1.0
+    for _ in range(TRIES if slope < 0 else 0):
+        tried = slopes_at(p + length * way)
+        end_slope = float(np.sum(tried.gradient * way))
+        if end_slope <= -0.5 * slope and tried.error <= slopes.error:
+            return p + length * way, tried
+        # Of a parabola with these slopes at its ends the lowest point, kept off both.
+        share = slope / (slope - end_slope) if end_slope != slope else 0.0  # equal only by rounding
+        length *= min(max(share, 0.1), 0.9)
+    return p + way / 2, slopes_at(p + way / 2)
+
+
+def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
+    """Return the powers [y sqrt(w b) - b]^+ / a (time, free) at the level y that the limits set.
+
+    They are [y rise - dry]^+ with rise = sqrt(w b) / a and dry = b / a. `weights`: w = -d error / d j of each path,
+    which carries the information j = p / (a p + b).
+    """
+    rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
+    steps = len(dry)
+    # The level at which each transmitter's mean is reached, then that of the total under these.
+    no_limit = np.full(steps, np.inf)
+    of_means = [
+        _find_level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps)
+        for i in range(dry.shape[1])
+    ]
+    highest = np.broadcast_to(of_means, dry.shape)
+    level = _find_level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
+    return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
+
+
+def _fill_to_level(
+    level: Float[np.ndarray, "*k"],
+    rise: Float[np.ndarray, "*k"],
+    dry: Float[np.ndarray, "*k"],
+    peak: Float[np.ndarray, "*k"],
+) -> Float[np.ndarray, "*k"]:
+    """Return the powers min([level rise - dry]^+, peak), of the arguments' shape; 0 where rise is 0, at any level."""
+    with np.errstate(invalid="ignore"):
+        wet = np.where(rise > 0, level * rise - dry, 0.0)
+    return np.clip(wet, 0.0, peak)
+
+
+def _find_level(
+    rise: Float[np.ndarray, "k"],
+    dry: Float[np.ndarray, "k"],
+    peak: Float[np.ndarray, "k"],
+    highest: Float[np.ndarray, "k"],
+    total: float,
+) -> float:
+    """Return the water level y at which k powers sum to the total; infinity where they do not reach it at any level.
+
+    A power is min([min(y, highest) rise - dry]^+, peak): it is 0 up to the level dry / rise, then grows by `rise` for
+    each unit of the level, until it has reached `peak` or the level `highest`.
+    """
+    grows = rise > 0
+    rise, dry, peak, highest = rise[grows], dry[grows], peak[grows], highest[grows]
+    if not rise.size or not np.isfinite(total):
+        return np.inf
+    # The sum is piecewise linear in the level: it bends where a power begins to grow, or stops.
+    turns = np.concatenate([dry / rise, (dry + peak) / rise, highest])
+    turns = np.unique(turns[np.isfinite(turns)])
+    sums = _fill_to_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)  # at each bend
+    if total < sums[-1]:
+        return float(np.interp(total, sums, turns))
+    # Above the last bend only powers without an end grow, each by its `rise`.
+    is_endless = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)
+    return float(turns[-1] + (total - sums[-1]) / rise[is_endless].sum()) if is_endless.any() else np.inf

@@ -1,0 +1,197 @@
+"""Power budgets: limits of what transmitters send, and linear gains maximised within them by a sort."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, SupportsFloat, cast
+
+import numpy as np
+
+from heliograph.numerics.check import fail, instance, scalar, table
+from heliograph.numerics.module import Module, readable
+from heliograph.numerics.types import ArrayLike, Bool, Float
+
+MET = 1e-9  # relative excess over a limit that counts as met
+
+Powers = Float[np.ndarray, "time free"]
+PerTransmitter = float | dict[str, float] | None
+
+
+@readable
+class Budget(Module):
+    """Limits of the power that transmitters send: in total, in each transmitter's mean, and at every step.
+
+    Transmitters that are not free count towards the total.
+
+    Args:
+        total: largest mean power of all transmitters together; none unless given.
+        per_transmitter: largest mean power over time of a transmitter: a number for all, or {name: number}.
+        peak: largest power of a transmitter at any step: a number for all, or {name: number}.
+
+    Raises:
+        ValueError: no limit at all, a negative one.
+    """
+
+    total: float | None
+    per_transmitter: PerTransmitter
+    peak: PerTransmitter
+
+    def __init__(
+        self,
+        total: "Float[ArrayLike, ''] | None" = None,
+        per_transmitter: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
+        peak: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
+    ):
+        self.total = None if total is None else float(scalar("total power", total, 0.0))
+        self.per_transmitter = _read_limit("power per transmitter", per_transmitter)
+        self.peak = _read_limit("peak power", peak)
+        if self.total is None and self.per_transmitter is None and self.peak is None:
+            raise fail("budget", "a total, a limit per transmitter or a peak", "none")
+
+
+def make_budget(value: object) -> Budget:
+    """Return a budget; a plain number is one of the total power."""
+    if isinstance(value, Budget):
+        return value
+    try:
+        number = float(cast(SupportsFloat, value))
+    except (TypeError, ValueError):
+        return instance("budget", value, Budget, "a number (the total power) or a Budget")
+    return Budget(number)
+
+
+def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
+    """Return a checked limit of powers: a number for all transmitters, or {name: number} for some; None for none."""
+    if value is None:
+        return None
+    if isinstance(value, Mapping):
+        named = table(name, value, "powers")
+        return {key: float(scalar(f"{name} {key!r}", number, 0.0)) for key, number in named.items()}
+    return float(scalar(name, value, 0.0))
+
+
+class PowerLimits(NamedTuple):
+    """Polytope of the powers p >= 0 (time, free transmitter) that a budget allows.
+
+    peak: of each entry; mean: of the mean over time of each column; total: of the mean over time of the sum. Infinite
+    where nothing limits.
+    """
+
+    peak: Powers
+    mean: Float[np.ndarray, "free"]
+    total: float
+
+    def find_best_powers(self, gain: Powers) -> Powers:
+        """Return the allowed powers q (time, free) with the largest sum of gain * q.
+
+        They are zero where the gain is not positive. Limits are nested (an entry, its column, all), so that entries
+        are filled greedily, the largest gain first.
+        """
+        powers, steps = np.zeros_like(gain), len(gain)
+        # What the limits of the total and of each transmitter leave, as sums over time.
+        total_left, left = self.total * steps, self.mean * steps
+        for entry in np.argsort(-gain, axis=None, kind="stable"):
+            k, h = np.unravel_index(entry, gain.shape)  # step and transmitter
+            if gain[k, h] <= 0 or total_left <= 0:
+                break
+            power = min(float(self.peak[k, h]), float(left[h]), total_left)
+            if not np.isfinite(power):
+                raise fail("budget", "one that limits every transmitter that helps", "no limit")
+            powers[k, h] = power
+            left[h] -= power
+            total_left -= power
+        return powers
+
+    def find_even_powers(self, on: Bool[np.ndarray, "time free"]) -> Powers:
+        """Return the largest allowed powers that are even: one level for all, or an entry's own limit if that is less.
+
+        They are zero where not `on`. A limit of the mean is kept at every step.
+        """
+        limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)
+        total = self.total * len(on)
+        if not np.isfinite(total):
+            return limit
+        # The level at which min(limit, level) sums to the total, if it ever does: entries in rising order of their
+        # limits take what is left of the total in equal parts, or their limits.
+        ordered = np.sort(limit.ravel())
+        for i, least_limit in enumerate(ordered):
+            level = total / (len(ordered) - i)
+            if level <= least_limit:
+                return np.minimum(limit, level)
+            total -= least_limit
+        return limit
+
+    def clip_powers(self, powers: Powers) -> Powers:
+        """Return the powers, cut at their peaks and then scaled down where a mean or the total is above its limit.
+
+        For powers that rounding, or a solver's accuracy, puts a little outside.
+        """
+        powers = np.clip(powers, 0.0, self.peak)
+        mean = powers.mean(axis=0)
+        powers = powers * np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)
+        total = powers.mean(axis=0).sum()
+        return powers * (self.total / total) if total > self.total else powers
+
+    def make_limit_rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
+        """Return (rows, bounds): the finite limits of mean and total as rows @ powers.ravel() <= bounds.
+
+        Each row is in units of its limit, so that bounds are 1, or 0 where nothing may be sent.
+        """
+        steps, count = self.peak.shape
+        rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
+        most = np.append(self.mean, self.total)
+        rows, most = rows[np.isfinite(most)], most[np.isfinite(most)]
+        scale = np.where(most > 0, most, 1.0)
+        return rows / scale[:, None], most / scale
+
+
+def make_unlimited(steps: int, count: int) -> PowerLimits:
+    """Return the limits of so many free transmitters over so many steps that exclude nothing."""
+    return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
+
+
+def make_power_limits(
+    budget: Budget, names: Sequence[str], free: Bool[np.ndarray, "hop"], powers: Float[np.ndarray, "time hop"]
+) -> PowerLimits:
+    """Return the limits that the budget leaves to the free transmitters, while the others send their `powers`.
+
+    Args:
+        budget: limits of all transmitters.
+        names: of all transmitters, in the order of the hops.
+        free: which of them are free (hop,).
+        powers: what each sends at present (time, hop); those of free ones do not matter.
+
+    Raises:
+        ValueError: limits for transmitters that there are not, powers of the others above the budget.
+    """
+    mean_limit = _list_limits("per_transmitter", budget.per_transmitter, names)
+    peak_limit = _list_limits("peak", budget.peak, names)
+    total_limit = np.inf if budget.total is None else budget.total
+    # What is not free has to be within the limits, and takes its part of the total.
+    fixed = np.where(free, 0.0, powers)  # (time, hop)
+    fixed_mean, fixed_peak = fixed.mean(axis=0), fixed.max(axis=0)
+    for name, sent, limit in zip(names, fixed_mean, mean_limit, strict=True):
+        _check_fixed_powers(f"power of {name!r}", sent, limit)
+    for name, sent, limit in zip(names, fixed_peak, peak_limit, strict=True):
+        _check_fixed_powers(f"peak of {name!r}", sent, limit)
+    _check_fixed_powers("total", fixed_mean.sum(), total_limit)
+    return PowerLimits(
+        peak=np.tile(peak_limit[free], (len(powers), 1)),
+        mean=mean_limit[free],
+        total=max(total_limit - fixed_mean.sum(), 0.0),
+    )
+
+
+def _check_fixed_powers(what: str, power: float, limit: float) -> None:
+    """Raise ValueError where transmitters that are not free send more than a limit; `what`: the limit, in words."""
+    if power > limit * (1 + MET):
+        expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
+        raise fail("budget", expected, f"{limit:.6g}")
+
+
+def _list_limits(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
+    """Return a limit for each transmitter in the order of `names`, infinite where there is none."""
+    if not isinstance(limit, dict):
+        return np.full(len(names), np.inf if limit is None else limit)
+    unknown = sorted(set(limit) - set(names))
+    if unknown:
+        raise fail(f"limit {kind!r} of the budget", f"names of transmitters {list(names)}", unknown)
+    return np.array([limit.get(name, np.inf) for name in names])

@@ -1,0 +1,262 @@
+"""One descent for all designs: sequential quadratic programmes from many starts, then Newton's method where they end.
+
+At a vector x a design problem has an error e(x) and transmits the powers p(x). Sought is
+    min e(x)         subject to  rows p(x) <= most  and  low <= x <= high,   or
+    min mean power   subject to  the same and  e(x) <= target.
+Where the powers themselves are free p(x) = x and the rows are linear; else p is any smooth function.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import Bounds, NonlinearConstraint, minimize
+
+from heliograph.numerics.types import Bool, Float
+
+Vector = Float[np.ndarray, "x"]
+
+ITERATIONS = 400
+FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and that of many of which the best goes on
+ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
+FEASIBLE = 1e-7  # relative excess over a limit that counts as none
+ACTIVE = 1e-7  # relative: how near a limit is one that is reached
+SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
+ROUNDING = 1e-14  # relative
+LEAST_SIZE = 1e-12  # unit of a value that is less, or 0, at the start
+
+
+class Evaluation(NamedTuple):
+    """Error and transmitted powers (all steps of all transmitters in one row) at a point, and their derivatives."""
+
+    error: float
+    error_slope: Vector
+    powers: Float[np.ndarray, "entries"]
+    power_slope: Float[np.ndarray, "entries x"]
+
+
+class PowerAndErrorLimits(NamedTuple):
+    """Limits rows @ powers <= most, with most 1 or 0, and error <= target if given; `steps` make the mean power."""
+
+    rows: Float[np.ndarray, "limits entries"]
+    most: Float[np.ndarray, "limits"]
+    target: float | None
+    steps: int
+
+
+class DescentProblem(NamedTuple):
+    """A design problem as a descent needs it.
+
+    low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
+    another, the last the sharpest. evaluate: error, powers and derivatives at x with a smoothing; None where they grow
+    without limit. restore: x moved back into the limits, as far as rounding took it out of them.
+    """
+
+    low: Vector
+    high: Vector
+    unit: Vector
+    sharpnesses: Sequence[int | None]
+    evaluate: Callable[[Vector, int | None], Evaluation | None]
+    restore: Callable[[Vector], Vector]
+
+
+class ScaledProgramme:
+    """A design problem with its limits, as a function of z = x / unit; values are divided by `size`, that of the start.
+
+    The room of a limit is the part of it that is left: negative where it is exceeded.
+
+    Args:
+        problem: the design problem.
+        limits: of powers, and of the error where there is a target.
+        sharpness: the smoothing of the error.
+        start: a point x, whose value sets the size.
+    """
+
+    def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
+        self.problem, self.limits, self.sharpness = problem, limits, sharpness
+        self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
+        self._last: tuple[bytes, Evaluation | None] = (b"", None)
+        self.size = 1.0
+        value = self.objective(start / problem.unit)[0]
+        self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
+
+    def evaluate_at(self, z: Vector) -> Evaluation | None:
+        """Return the evaluation at a point z, None where it does not exist; the last one is cached."""
+        key = z.tobytes()
+        if key != self._last[0]:
+            self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
+        return self._last[1]
+
+    def objective(self, z: Vector) -> tuple[float, Vector]:
+        """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
+
+        Infinite where the point does not exist.
+        """
+        evaluation = self.evaluate_at(z)
+        if evaluation is None:
+            return np.inf, np.zeros_like(z)
+        if self.limits.target is None:
+            return evaluation.error / self.size, evaluation.error_slope * self.problem.unit / self.size
+        scale = self.limits.steps * self.size
+        return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
+
+    def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
+        """Return the unused part of each limit at z, that of the target error last: negative where one is exceeded.
+
+        Rows of limits are scaled so that a limit is 1 (or 0), hence 1 - powers / limit; the target gives
+        1 - error / target. All are -1 at a point without an evaluation, where the error grows without limit.
+        """
+        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        evaluation = self.evaluate_at(z)
+        if evaluation is None:
+            return np.full(len(most) + (target is not None), -1.0)
+        room = most - rows @ evaluation.powers
+        return room if target is None else np.append(room, 1 - evaluation.error / target)
+
+    def limit_room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
+        """Return the derivative of `limit_room` by z, (limits, x)."""
+        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        evaluation = self.evaluate_at(z)
+        if evaluation is None:
+            return np.zeros((len(most) + (target is not None), len(z)))
+        slope = -(rows @ evaluation.power_slope) * self.problem.unit
+        return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
+
+    def is_feasible(self, z: Vector) -> bool:
+        """Return whether the point exists and meets the limits, to FEASIBLE."""
+        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE))
+
+    def merit(self, z: Vector) -> float:
+        """Return the value of a feasible point, else infinite."""
+        return self.objective(z)[0] if self.is_feasible(z) else np.inf
+
+    def descend(self, z: Vector, tolerance: float) -> Vector:
+        """Return the point where a sequential quadratic programme ends, or the start where that is better."""
+        constraints = []
+        if len(self.limit_room(z)):
+            constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
+        before = self.merit(z)
+        end = self._minimize(self.objective, z, constraints, tolerance)
+        # Neither the start nor the end is within the limits: first back into them, then down again.
+        if np.isinf(before) and not self.is_feasible(end):
+            end = self._minimize(self._compute_squared_excess, end, [], tolerance)
+            return self._minimize(self.objective, end, constraints, tolerance)
+        return end if self.merit(end) < before else z
+
+    def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:
+        """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
+        broken = np.minimum(self.limit_room(z), 0.0)
+        return float(broken @ broken), 2 * broken @ self.limit_room_slope(z)
+
+    def _minimize(
+        self,
+        function: Callable[[Vector], tuple[float, Vector]],
+        z: Vector,
+        constraints: list[NonlinearConstraint],
+        tolerance: float,
+    ) -> Vector:
+        """Return the end of SLSQP's minimisation of a function from z, within bounds and constraints.
+
+        `function`: z -> value and gradient. The end is moved to where the limits hold; it is z if it is not finite.
+        """
+        optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
+                          options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
+        end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
+        unit = self.problem.unit
+        return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
+
+    def polish_by_newton(self, z: Vector) -> Vector:
+        """Return the point after Newton's steps on the active limits, as long as no exact penalty rises by them.
+
+        `z`: where a descent ended, within the limits.
+        """
+        for _ in range(ROUNDS):
+            newton = self._solve_newton_step(z)
+            if newton is None:
+                break
+            step, multipliers, active = newton
+            if np.all(np.abs(step) <= ROUNDING):
+                break
+            unit = self.problem.unit
+            end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
+            before, after = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
+            if not (self.is_feasible(end) and after <= before * (1 + ROUNDING)):
+                break
+            z = end
+        return z
+
+    def _compute_penalised_value(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
+        """Return the value plus the excess over the active limits, weighed by their multipliers."""
+        excess = np.maximum(-self.limit_room(z), 0.0)
+        return float(self.objective(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
+
+    def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
+        """Return the step d from z, the multipliers m of the active limits, and which limits are active.
+
+        Over the variables at no bound it solves H d - A' m = -g and A d = -room, with the gradient g of the value, the
+        slopes A of the active limits' room, and H the Hessian of the Lagrangian value - m' room. None where all
+        variables are at bounds, or derivatives are not finite.
+        """
+        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))  # variables at no bound
+        room = self.limit_room(z)
+        active = room <= ACTIVE
+        if not len(index):
+            return None
+        # A and g, by each variable over its own size.
+        scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
+        slopes = self.limit_room_slope(z)[active][:, index] * scale
+        gradient = self.objective(z)[1][index] * scale
+        # The multipliers with which A' m comes nearest to the gradient, and the Hessian of the Lagrangian with these.
+        multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
+        hessian = self._differentiate_lagrangian(z, multipliers, active, index, scale)
+        # The equations of Karush, Kuhn and Tucker on the active limits, with H made symmetric.
+        system = np.block([[(hessian + hessian.T) / 2, -slopes.T], [slopes, np.zeros((len(slopes), len(slopes)))]])
+        right = np.concatenate([-gradient, -room[active]])
+        if not np.all(np.isfinite(system)):
+            return None
+        solution = np.linalg.lstsq(system, right, rcond=ROUNDING)[0]
+        step = np.zeros_like(z)
+        step[index] = scale * solution[: len(index)]
+        return step, solution[len(index) :], active
+
+    def _differentiate_lagrangian(
+        self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"], index: np.ndarray, scale: Vector
+    ) -> Float[np.ndarray, "k k"]:
+        """Return the Hessian of the Lagrangian value - m' room at z, by differences of its gradients.
+
+        Args:
+            z: the point.
+            multipliers: m, of the active limits.
+            active: which limits are.
+            index: the k variables by which it is differentiated.
+            scale: size of each of them, in units of which the Hessian is.
+        """
+
+        def lagrangian_gradient(point: Vector) -> Vector:
+            gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
+            return np.asarray((gradient - multipliers @ slopes)[index] * scale)
+
+        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
+        for column, variable in enumerate(index):
+            shift = np.zeros_like(z)
+            shift[variable] = SHIFT * scale[column]
+            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
+        return hessian
+
+
+def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, starts: Sequence[Vector]) -> Vector | None:
+    """Return the best end x of descents from these points x, refined and polished; None where none meets the limits."""
+    points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
+    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
+    for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
+        programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]
+        points = [programme.descend(z, COARSE) for programme, z in zip(programmes, points, strict=True)]
+    programme = ScaledProgramme(problem, limits, sharpest, points[0] * problem.unit)
+    best = min(points, key=programme.merit)
+    # A fine descent from the best, begun again as long as that helps.
+    for _ in range(ROUNDS):
+        before = programme.merit(best)
+        best = programme.descend(best, FINE)
+        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
+            break
+    return programme.polish_by_newton(best) * problem.unit if programme.is_feasible(best) else None

@@ -1,0 +1,377 @@
+"""Powers of transmitters whose signals add up at a receiver: designs for a small error, or for a small power.
+
+Of one scalar signal the best amplitudes have closed forms (`summed_links`); of several states they are searched, beside
+a bound.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from heliograph.factors.square_root_update import observe_information, roots_of
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import check_count, check_seed, fail, scalar
+from heliograph.numerics.types import Bool, Float
+from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
+from heliograph.planning.network_from_design import add_best_filter
+from heliograph.planning.plant_moments import (
+    measured_moment_with_one,
+    require_constant_noise,
+    require_design_plant,
+    steady_moment_with_one,
+)
+from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
+from heliograph.planning.sum_of_links import ALIKE, HALVINGS, SummedLinks, Vector, find_amplitudes_by_formula
+from heliograph.planning.transmitters import (
+    amplify_transmitter,
+    compute_sent_powers,
+    find_free_transmitters,
+    transmitter_names,
+)
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.sum_of_maps import Superposed
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+SEARCHES = 30  # of a power that reaches a target: to 1e-9 of it
+DOUBLINGS = 100  # of a power without limit, until it reaches a target
+
+
+def is_sum_of_links(network: object) -> bool:
+    """Return whether a network is one node that receives a sum of links."""
+    if not isinstance(network, Network) or network.relays is not None or network.common is not None:
+        return False
+    nodes = list(network.nodes.values())
+    return len(nodes) == 1 and isinstance(nodes[0], Node) and isinstance(nodes[0].channel, Superposed)
+
+
+class SumOfLinksTask(NamedTuple):
+    """What a design of a sum of links searches: amplitudes of the free links, within limits, for a small error.
+
+    An amplitude is the factor by which a link's transmitter multiplies what it measures.
+
+    links: rows, noises and amplitudes at present. limits: of the free links' powers. free: which links are. covariance:
+    J (n, n), the information of a step, -> steady error covariance; error: covariance -> the number to be small.
+    starts, seed: of searches.
+    """
+
+    links: SummedLinks
+    limits: PowerLimits
+    free: Bool[np.ndarray, "links"]
+    covariance: Callable[[np.ndarray], np.ndarray]
+    error: Callable[[np.ndarray], float]
+    starts: int
+    seed: int
+
+    @property
+    def fixed(self) -> float:
+        """Power of the links that are not free."""
+        links = self.links
+        return float((links.present**2 * links.unit)[~self.free].sum())
+
+    @property
+    def caps(self) -> Vector:
+        """Largest amplitude of each link: a power a^2 t below peak and mean limit where it is free, else the present.
+
+        The error is steady, so limits have one step.
+        """
+        links = self.links
+        caps: Vector = np.abs(links.present)
+        caps[self.free] = np.sqrt(np.minimum(self.limits.peak[0], self.limits.mean) / links.unit[self.free])
+        return caps
+
+    @property
+    def largest_total(self) -> float:
+        """Largest power that all free links may send together."""
+        links = self.links
+        return min(self.limits.total, float((self.caps**2 * links.unit)[self.free].sum()))
+
+    def compute_error(self, amplitudes: Vector) -> float:
+        """Return the error with these amplitudes of all links."""
+        return self.error(self.covariance(self.links.information(amplitudes)))
+
+    def bound_error(self, total: float) -> float:
+        """Return a lower bound of the error of all amplitudes with this total power of the free links."""
+        all_links = total + self.fixed
+        states = self.links.rows.shape[1]
+        information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
+        return self.error(self.covariance(information))
+
+    def find_amplitudes_by_formula(self, total: float) -> Vector | None:
+        """Return the best amplitudes by a formula, None where there is none: it needs one signal and all links free."""
+        return find_amplitudes_by_formula(self.links, total, self.caps) if np.all(self.free) else None
+
+    def search_amplitudes(self, total: float, starts: int, first: Vector | None = None) -> Vector:
+        """Return the amplitudes (links,) of the least error that descents find from `first` and from drawn starts.
+
+        Amplitudes may be negative: their signs matter where noises of links are correlated.
+
+        Args:
+            total: power that the free links may send together.
+            starts: number of starts that are drawn.
+            first: amplitudes at which the first descent begins (links,); none unless given.
+        """
+        links, free = self.links, self.free
+        # The free amplitudes a are searched as x = a / scale in [-1, 1], the scale being the most that limits allow.
+        scale = np.minimum(self.caps[free], np.sqrt(total / links.unit[free]))
+        if not np.all(np.isfinite(scale)):
+            raise fail("budget", "one that limits every transmitter", "no limit")
+
+        def amplitudes_at(x: Vector) -> Vector:
+            """Return the amplitudes of all links at x, the free ones scaled down where they exceed the total."""
+            a = np.clip(x, -1, 1) * scale
+            power = float(a**2 @ links.unit[free])
+            amplitudes = links.present.copy()
+            amplitudes[free] = a * np.sqrt(total / power) if power > total else a
+            return amplitudes
+
+        def error_at(x: Vector) -> float:
+            return self.compute_error(amplitudes_at(x))
+
+        generator = np.random.default_rng(self.seed)
+        points = [generator.uniform(-1.0, 1.0, len(scale)) for _ in range(starts)]
+        if first is not None:
+            points = [np.divide(first[free], scale, out=np.zeros_like(scale), where=scale > 0), *points]
+        best, least = links.present, np.inf
+        for point in points:
+            result = scipy.optimize.minimize(error_at, point, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
+            if result.fun < least:
+                best, least = amplitudes_at(np.asarray(result.x)), float(result.fun)
+        return best
+
+
+def design_sum_of_links(problem: DesignProblem, network: Network) -> PowerDesign:
+    """Return the powers of the least steady error within the budget, or the least power that reaches a target error.
+
+    By closed forms where all links of one signal are free, else by a search with a bound beside it.
+
+    Args:
+        problem: budget, error or target error, and which transmitters are free.
+        network: of one node, which receives a sum of links (`superposed`).
+
+    Raises:
+        ValueError: parts that the formulas do not cover; `hg.design` of a function of free numbers does.
+    """
+    ((name, node),) = network.nodes.items()
+    error = problem.criterion
+    assert isinstance(node, Node)  # by `is_sum_of_links`
+    assert isinstance(node.channel, Superposed)
+    if error.steps > 1:
+        raise fail("design of a sum of links", "the steady error", f"an error over {error.steps} steps")
+    plant, process = require_constant_noise(require_design_plant(network.plant))
+    measured = np.asarray(measured_moment_with_one(node.sensor, steady_moment_with_one(plant)))  # E (y, 1)(y, 1)'
+    links, unit_channel = find_links_of_sum(node, measured)
+    names = tuple(f"{name}.{hop}" for hop in transmitter_names(node.channel))
+    task = _make_task(problem, plant, process, links, names)
+    # The best amplitudes, for the error within the budget or for the power at the target.
+    if problem.target_error is None:
+        amplitudes, certificate = _find_least_error_amplitudes(task, task.limits.total)
+    else:
+        target = float(scalar("target error", problem.target_error, 0.0))
+        amplitudes, certificate = _find_least_power_amplitudes(task, target)
+    # The channel with these: the one of unit amplitudes, amplified.
+    channel: AbstractRandomAffine = unit_channel
+    for hop, amplitude in zip(transmitter_names(node.channel), amplitudes, strict=True):
+        channel = amplify_transmitter(channel, hop, float(amplitude))
+    return PowerDesign(
+        problem=problem,
+        powers={name: np.array([power]) for name, power in zip(names, amplitudes**2 * links.unit, strict=True)},
+        error=task.compute_error(amplitudes),
+        certificate=certificate,
+        present=task.compute_error(links.present),
+        covariance=task.covariance(links.information(amplitudes))[None],
+        sensitivity=dict.fromkeys(names, float("nan")),
+        price=float("nan"),
+        numbers={},
+        realised=Network(network.plant, {name: add_best_filter(network.plant, node, channel)}),
+    )
+
+
+def _make_task(
+    problem: DesignProblem, plant: LinearPlant, process: AbstractNoise, links: SummedLinks, names: Sequence[str]
+) -> SumOfLinksTask:
+    """Return the search: which links are free, the limits of their powers, and the error by a step's information.
+
+    `names`: of the links' transmitters, in the order of the links.
+    """
+    free = find_free_transmitters(names, problem.free)
+    limits = make_unlimited(1, int(free.sum()))
+    if problem.budget is not None:
+        sent = links.present**2 * links.unit
+        limits = make_power_limits(make_budget(problem.budget), names, free, sent[None])
+    transition, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
+    criterion = problem.criterion.criterion(plant.states)
+    return SumOfLinksTask(
+        links=links,
+        limits=limits,
+        free=free,
+        covariance=lambda information: steady_covariance_with_information(transition, noise, information),
+        error=lambda covariance: criterion.compute_exact_error(covariance[None]),
+        starts=check_count("starts", problem.starts),
+        seed=check_seed("seed", problem.seed),
+    )
+
+
+def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Vector, Certificate]:
+    """Return the amplitudes (links,) of the least error with a total power of the free links, and the certificate."""
+    solution = task.find_amplitudes_by_formula(total)
+    if solution is not None:
+        error = task.compute_error(solution)
+        return solution, Certificate(convex=True, value=error, bound=error, stationarity=0.0, starts=1, unit="error")
+    found = task.search_amplitudes(total, task.starts)
+    error = task.compute_error(found)
+    bound = min(task.bound_error(min(total, task.largest_total)), error)
+    return found, Certificate(
+        convex=False, value=error, bound=bound, stationarity=np.nan, starts=task.starts, unit="error"
+    )
+
+
+def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
+    """Return the amplitudes (links,) of the least power that reach a target error, and the certificate.
+
+    By bisection of the power of the free links, since the least error falls with it.
+    """
+    best, certificate = _find_amplitudes_that_reach(task, target)
+    largest = float((best**2 * task.links.unit)[task.free].sum())
+    low, high = 0.0, largest
+    for _ in range(HALVINGS if certificate.convex else SEARCHES):
+        middle = (low + high) / 2
+        tried = _find_best_at_power(task, middle, best)
+        if task.compute_error(tried) <= target:
+            high, best = middle, tried
+        else:
+            low = middle
+        if high - low <= ALIKE * largest:
+            break
+    needed = float((best**2 * task.links.unit).sum())
+    bound = needed if certificate.convex else _bound_least_power(task, target, needed)
+    return best, certificate._replace(value=needed, bound=bound, unit="power")
+
+
+def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vector:
+    """Return the best amplitudes at a power of the free links: by formula, else by one descent from `near`."""
+    if not power > 0:
+        return np.where(task.free, 0.0, task.links.present)
+    solution = task.find_amplitudes_by_formula(power)
+    return task.search_amplitudes(power, 1, near) if solution is None else solution
+
+
+def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> float:
+    """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
+
+    By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
+    """
+    low, high = 0.0, needed - task.fixed
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if task.bound_error(middle) <= target else (middle, high)
+    return low + task.fixed
+
+
+def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
+    """Return amplitudes that reach a target error: with all power within the limits, or doubled where none limits.
+
+    Raises:
+        ValueError: a target that is not reached.
+    """
+    unlimited = not np.isfinite(task.largest_total)
+    total = task.largest_total
+    if unlimited:  # a power to begin doubling with: that sent at present, or the receiver's noise
+        total = max(float((task.links.present**2 * task.links.unit).sum()), task.links.floor)
+    found, certificate = _find_least_error_amplitudes(task, total)
+    for _ in range(DOUBLINGS if unlimited else 0):
+        if certificate.value <= target:
+            break
+        total = 2 * total
+        found, certificate = _find_least_error_amplitudes(task, total)
+    if certificate.value > target * (1 + ALIKE):
+        within = "whatever the power" if unlimited else "within the budget"
+        raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
+    return found, certificate
+
+
+def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[SummedLinks, Superposed]:
+    """Return the links of a node's sum, as arrays of the design, and the sum in which all amplitudes are 1.
+
+    Each link sends one output y_i of the sensor with a random gain g_i; an amplitude of 1 sends y_i as it is.
+
+    Args:
+        node: with a linear sensor behind a sum of links.
+        second: E (y, 1)(y, 1)' of the sensor's outputs.
+
+    Raises:
+        ValueError: a sensor or a sum that the formulas do not cover.
+    """
+    sensor, channel = _require_plain_sum(node)
+    # The sum in which each transmitter sends what it measures (an amplification of None).
+    unit = channel
+    for hop in transmitter_names(channel):
+        amplified = amplify_transmitter(unit, hop, None)
+        assert isinstance(amplified, Superposed)
+        unit = amplified
+    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver. The
+    # centre of second moments is Cov of (g, n) x (g, n): [0, 0, 0, 0] is Var g, [0, 0, -1, -1] is Var n.
+    moments = [second_order(link) for link in unit.maps]
+    mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
+    variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
+    floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
+    # D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with the noise R of the outputs that are sent, t_i = E y_i^2.
+    outputs = [of_link[0] for of_link in channel.places]
+    power = np.array(list(compute_sent_powers(unit, second).values()))
+    sensor_noise = np.asarray(sensor.noise.covariance)[np.ix_(outputs, outputs)]
+    # Present amplitudes: sizes from powers, signs from mean gains, beside those of unit amplitudes.
+    sizes = np.sqrt(np.array(list(compute_sent_powers(channel, second).values())) / power)
+    present_gains = np.array([float(second_order(link).mean_gain[0, 0]) for link in channel.maps])
+    signs = np.sign(present_gains) * np.sign(mean)
+    links = SummedLinks(
+        rows=mean[:, None] * np.asarray(sensor.matrix)[outputs],
+        noise=np.outer(mean, mean) * sensor_noise + np.diag(variance * power),
+        unit=power,
+        floor=floor,
+        present=np.where(signs == 0, 1.0, signs) * sizes,
+    )
+    return links, unit
+
+
+def _require_plain_sum(node: Node) -> tuple[LinearSensor, Superposed]:
+    """Return the sensor and the sum of a node; ValueError where a design has no formulas for them."""
+    sensor, channel = node.sensor, node.channel
+    if not isinstance(sensor, LinearSensor) or sensor.circular:
+        raise _make_no_formula_error("a sensor that varies, is not linear or has angles")
+    assert isinstance(channel, Superposed)
+    if channel.outputs > 1 or channel.past or channel.remembers or channel.corner_count() > 1:
+        raise _make_no_formula_error("several outputs, delays, memory or uncertain probabilities")
+    counts = [len(transmitter_names(link)) for link in channel.maps]
+    if any(count != 1 for count in counts) or any(link.inputs > 1 for link in channel.maps):
+        raise _make_no_formula_error(f"{counts} hops and {[link.inputs for link in channel.maps]} numbers")
+    return sensor, channel
+
+
+def _make_no_formula_error(got: str) -> ValueError:
+    """Return the error that names a sum for which there are no formulas."""
+    expected = "links of one known hop each, for one number (else give a function of free numbers)"
+    return fail("design of a sum of links", expected, got)
+
+
+def steady_covariance_with_information(
+    matrix: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"], information: Float[np.ndarray, "n n"]
+) -> Float[np.ndarray, "n n"]:
+    """Return the steady covariance after each step of a filter of x+ = A x + w that receives this information in each.
+
+    Args:
+        matrix: A.
+        process: Cov w.
+        information: J, taken as J = H' H, a measurement H x with noise of covariance I; zero where nothing is told.
+    """
+    values, vectors = np.linalg.eigh(information)
+    used = values > ALIKE * max(values[-1], 0.0)
+    if not used.any():
+        return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
+    h = (vectors[:, used] * np.sqrt(values[used])).T
+    prior = scipy.linalg.solve_discrete_are(matrix.T, h.T, process, np.eye(len(h)))
+    return observe_information(roots_of(prior), information).covariance

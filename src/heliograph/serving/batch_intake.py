@@ -1,0 +1,342 @@
+"""Intake of a batch of messages: plants that an implausible one has changed are restored, and take the rest again."""
+
+from collections import OrderedDict
+from collections.abc import Container, Sequence
+from datetime import UTC, datetime, time
+from math import floor, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap, make_first_leap
+from heliograph.live.event import INPUTS, CheckedEvent, Verdict
+from heliograph.live.fleet import Fleet
+from heliograph.live.implausible_events import CandidateEvent, JudgementReader
+from heliograph.live.link_counts import LinkCounts
+from heliograph.live.plant_state import PlantState, WithdrawnEvent
+from heliograph.numerics.check import InputError
+from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
+
+
+class MessageOutcome(NamedTuple):
+    """What became of a message.
+
+    Attributes:
+        plant: its plant; None if it began none.
+        verdict: the verdict on it; None if it could not be read.
+        why: the reason, where it was not used; else "".
+        notes: on parts that were left out of a used message.
+    """
+
+    plant: PlantState | None = None
+    verdict: Verdict | None = None
+    why: str = ""
+    notes: Sequence[str] = ()
+
+
+class PlantBeforeBatch(NamedTuple):
+    """State of a plant before a batch.
+
+    Attributes:
+        known: whether it was in memory.
+        clock: its newest arrival, and the leap in time that led there, if any (`PlantState.clock`).
+        links: by node the fields of its `LinkCounts`.
+    """
+
+    known: bool
+    clock: tuple[float, ClockLeap | None]
+    links: dict[str, tuple[Any, ...]]
+
+
+class TimedEvents(NamedTuple):
+    """The events of a message with times as numbers from the plant's `origin`.
+
+    Attributes:
+        at: when it was measured.
+        arrival: when it arrived.
+        clock: the present by this machine's clock; None where times have no origin to compare with.
+        origin: the date from which times are counted; None where they are numbers.
+        event: its measurement.
+        inputs: its inputs, None if it has none.
+    """
+
+    at: float
+    arrival: float
+    clock: float | None
+    origin: datetime | None
+    event: CheckedEvent
+    inputs: CheckedEvent | None
+
+
+class BatchIntake:
+    """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
+
+    def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
+        """Prepare to give messages to plants; `plants`, by name, are those in memory, which are changed."""
+        self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
+        # Why something is refused, by the number of its message and whether it is the message's inputs.
+        self._refused: dict[tuple[int, bool], str] = {}
+        # Of the present round: plants as they were, by name, and the events that they used, to be judged.
+        self._before: dict[str, PlantBeforeBatch] = {}
+        self._taken: list[CandidateEvent] = []
+        self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
+        self.replaced: list[tuple[PlantState, list[WithdrawnEvent]]] = []  # these as they were, with their events
+
+    def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[MessageOutcome]:
+        """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
+
+        `wall` is the time by this machine's clock. Afterwards the plants are as if the messages refused as implausible
+        had never arrived.
+        """
+        self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
+        outcomes = [MessageOutcome()] * len(messages)
+        # One plant after another, so that its memory is near; the messages of a plant in their order. Those that could
+        # not be read have no plant, and stand under "".
+        numbers_by_plant: dict[str, list[int]] = {}
+        for i, message in enumerate(messages):
+            name = find_plant_name(message)
+            if name is None or name not in damaged:
+                numbers_by_plant.setdefault(name or "", []).append(i)
+        waiting = [i for numbers in numbers_by_plant.values() for i in numbers]
+        # Each round refuses at least one message, restores its plant, and gives the plant its other messages again.
+        while waiting:
+            self._before, self._taken = {}, []
+            for i in waiting:
+                outcomes[i] = self._take_message(i, messages[i], wall)
+            restored = self._refuse_implausible()
+            waiting = [i for i in waiting if find_plant_name(messages[i]) in restored]
+        self._taken = []
+        return outcomes
+
+    def _refuse_implausible(self) -> set[str]:
+        """Step what was taken, note what is implausible in `_refused`, and restore its plants; return their names."""
+        self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
+        restored = set[str]()
+        for i, why in self._judges.find_implausible(self._taken).items():
+            taken = self._taken[i]
+            self._refused[taken.number, taken.event.is_inputs] = why
+            restored.add(taken.plant.name)
+        for name in restored:
+            self._restore_plant(name)
+        return restored
+
+    def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
+        """Give a message to its plant, as far as it was read; return its outcome."""
+        if isinstance(message, str):
+            return MessageOutcome(why=message)
+        if isinstance(message, UnreadMessage):
+            return MessageOutcome(self._count_unread(message), why=message.why)
+        try:
+            return self._use_message(number, message, wall)
+        except InputError as error:  # of another kind than its plant expects
+            return MessageOutcome(self._count_unread(UnreadMessage(message, str(error))), why=str(error))
+
+    def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
+        """Return {(number of a message, True): why its inputs lead to no valid prediction}, as `_refused` has it.
+
+        They are predicted with from the state before the batch.
+        """
+        numbers, plants, inputs = list[int](), list[PlantState | None](), []
+        for i, message in enumerate(messages):
+            if isinstance(message, str | UnreadMessage):
+                continue
+            values = message.values if message.node == INPUTS else message.inputs
+            if values and len(values) == self.fleet.program.given:
+                numbers.append(i)
+                plants.append(self.plants.get(message.plant))
+                inputs.append(values)
+        reasons = self._judges.explain_implausible_inputs(plants, np.array(inputs, dtype=np.float64))
+        return {(i, True): why for i, why in zip(numbers, reasons, strict=True) if why}
+
+    def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> MessageOutcome:
+        """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
+
+        `number`: of the message in the batch. `wall`: the time by this machine's clock.
+        """
+        plant = self._find_plant(message, wall)
+        timed = self._read_events(message, plant, wall)
+        # Values beyond limits do not count as received; an event of such values only is implausible.
+        screened = self.fleet.screen_event(message.node, timed.event, plant)
+        why, why_inputs = screened.why if screened.is_empty else "", None
+        # What an earlier round found implausible, in the event or in the inputs that came with it; most often nothing.
+        if self._refused:
+            why = self._refused.get((number, timed.event.is_inputs)) or why
+            why_inputs = self._refused.get((number, True)) if timed.inputs is not None else None
+        # A new plant begins with a message that is plausible and of a right clock.
+        if plant is None:
+            if timed.at > timed.arrival + self.fleet.options.ahead:
+                return MessageOutcome(verdict="future")
+            nothing_is_plausible = why and (timed.inputs is None or why_inputs)
+            if nothing_is_plausible:
+                return MessageOutcome(verdict="implausible", why=why)
+            # Its first moment counts as a leap in time, by one clock that may be wrong: that of arrivals where given.
+            has_arrival = message.arrival is not None
+            leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
+            plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
+        plant = self._note_plant_before_batch(plant, timed.at)
+        # Inputs and measurement are used or refused independently.
+        notes = self._use_inputs(number, plant, message, timed, why_inputs)
+        verdict: Verdict = "implausible"
+        if not why:
+            verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock)
+        self.fleet.count_event(plant, message.node, screened, verdict)
+        if screened.why and verdict == "used":
+            notes.append(f"{screened.why}; the rest is used")
+        return MessageOutcome(plant, verdict, why, notes)
+
+    def _use_inputs(
+        self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
+    ) -> list[str]:
+        """Give a measurement's inputs to its plant, if it has any; return a note if they are refused, for a reason."""
+        if timed.inputs is None:
+            return []
+        if why_refused is None:
+            self._give_to_plant(number, plant, message, timed.inputs, timed.clock)
+            return []
+        plant.link_counts(INPUTS).implausible += 1
+        return [f"inputs {message.inputs}: {why_refused}; the rest is used"]
+
+    def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
+        """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
+        origin = self._choose_origin(message) if plant is None else plant.origin
+        at = message.time
+        if origin is not None or not isinstance(at, float):
+            at = self._time_as_number(at, origin, message.plant)
+        # Without a time of arrival it arrived when measured, or, if late, when the plant's newest message did.
+        if message.arrival is None:
+            arrival = at if plant is None else max(plant.confirmed, at)
+        else:
+            arrival = self._time_as_number(message.arrival, origin, message.plant)
+        clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
+        event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
+        if message.inputs is not None:
+            inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
+        return TimedEvents(at=at, arrival=arrival, clock=clock, origin=origin, event=event, inputs=inputs)
+
+    def _count_unread(self, unread: UnreadMessage) -> PlantState | None:
+        """Count a message that came but cannot be used, and what it is refused for; it is not counted as lost.
+
+        Returns its plant; None where plant, node or time of the message are none that is known.
+        """
+        message = unread.read
+        plant, node = self.plants.get(message.plant), message.node
+        if plant is None or (node != INPUTS and node not in self.fleet.network.names):
+            return None
+        try:
+            at = self._time_as_number(message.time, plant.origin, plant.name)
+        except InputError:  # a time of another kind
+            return None
+        link = self._note_plant_before_batch(plant, at).link_counts(node)
+        if unread.counted:
+            link.count_unread(message.sequence, at, self.fleet.periods.get(node, 0))
+        if unread.reason is not None:
+            link.count_refused(unread.reason)
+        return plant
+
+    def _note_plant_before_batch(self, plant: PlantState, begun: float) -> PlantState:
+        """Return the plant, and note once in a batch what it was before, for `_restore_plant`; a new one is added.
+
+        `begun`: time of the first event of a new plant.
+        """
+        if plant.name not in self.plants:
+            self.plants[plant.name] = plant
+            self._before[plant.name] = PlantBeforeBatch(known=False, clock=(begun, None), links={})
+        elif plant.name not in self._before:
+            links = {name: tuple(vars(link).values()) for name, link in plant.links.items()}
+            self._before[plant.name] = PlantBeforeBatch(known=True, clock=plant.clock, links=links)
+        return plant
+
+    def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
+        """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
+        at, step = convert_time_to_seconds(moment, origin, plant), self.fleet.options.step
+        return at if origin is None or step is None else floor(at / step + 0.5)
+
+    def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
+        """Return the plant of a message; None if it has to begin, or to begin anew since its first clock was wrong.
+
+        That is so where the message goes on from before the leap with which the plant began, and where that is in the
+        future of the clock on the wall, with which the message agrees.
+        """
+        plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
+        has_other_kind_of_time = plant is not None and isinstance(message.time, datetime) != (plant.origin is not None)
+        if plant is None or has_other_kind_of_time:  # such a message is refused later
+            return plant
+        at = self._time_as_number(message.time, plant.origin, plant.name)
+        # The clock that decides: that of arrivals, where one was given, else the sender's; and what it says.
+        clock, clock_time = message.node, at
+        if message.arrival is not None:
+            clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
+        # The leap with which the plant began: the message takes that back if it goes on from before.
+        first, newest = find_contradicted_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
+        began_with_it = first is not None and first.now == -inf and not plant.holds_rows_before(first, at, longest_gap)
+        if first is not None and began_with_it and first.is_taken_back_by(clock, clock_time, newest):
+            return None
+        # The clock on the wall agrees with the message, and not with the plant.
+        if plant.origin is not None:
+            now = self._time_as_number(wall, plant.origin, plant.name)
+            is_plant_ahead, is_message_right = plant.confirmed > now + longest_gap, abs(at - now) <= longest_gap
+            if is_plant_ahead and is_message_right:
+                return None
+        return plant
+
+    def _begin_plant(self, name: str, at: float, origin: datetime | None, leap: ClockLeap) -> PlantState:
+        """Return a new plant, whose first moment may still turn out wrong.
+
+        Of one that begins anew the old is ended, and its events are counted as from the future.
+        """
+        plant, old = self.fleet.begin_plant(name, at, origin), self.plants.pop(name, None)
+        plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
+        if old is not None:
+            plant.version = self._anew[name] = old.version
+            events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
+            self.replaced.append((old, events))
+            for node_index, sequence, time in events:
+                node = INPUTS if node_index < 0 else self.fleet.network.names[node_index]
+                plant.link_counts(node).count("future", sequence, time)
+            self._before.pop(name, None)
+            self._taken = [taken for taken in self._taken if taken.plant is not old]
+            self.fleet.end_plant(old)
+        return plant
+
+    def _give_to_plant(
+        self, number: int, plant: PlantState, message: AnyMessage, event: CheckedEvent, wall: float | None
+    ) -> Verdict:
+        """Let the plant judge an event and return the verdict; note the event as taken if it is used.
+
+        Args:
+            number: number of its message in the batch.
+            plant: the plant.
+            message: its message, by whose node's clock it is dated.
+            event: the event.
+            wall: time by the clock on the wall, None if it is not known.
+        """
+        is_dated = message.arrival is not None
+        verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
+        if verdict == "used":
+            row, _ = plant.changes[-1]  # that which holds it now
+            self._taken.append(CandidateEvent(number, plant, event, row))
+        return verdict
+
+    def _restore_plant(self, name: str) -> None:
+        """Restore a plant to its state before the batch."""
+        plant, before = self.plants[name], self._before[name]
+        if before.known:
+            self.fleet.undo_events(plant, before.clock)
+            plant.links = {node: LinkCounts(*counts) for node, counts in before.links.items()}
+        else:
+            self.fleet.end_plant(self.plants.pop(name))
+
+    def _choose_origin(self, message: AnyMessage) -> datetime | None:
+        """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
+        if not isinstance(message.time, datetime):
+            return None
+        if self.fleet.program.dt is None:
+            return None if self.fleet.options.step is None else message.time
+        return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
+
+
+def find_plant_name(message: Read) -> str | None:
+    """Return the name of the plant of a message; None of one that names none."""
+    if isinstance(message, str):
+        return None
+    return message.read.plant if isinstance(message, UnreadMessage) else message.plant

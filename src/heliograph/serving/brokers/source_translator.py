@@ -1,0 +1,282 @@
+"""Messages of topics that others make, to messages of a network by its sources."""
+
+from collections import Counter, OrderedDict
+from collections.abc import Collection, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from heliograph.files.messages.message_files import FileMessage, make_default_topic
+from heliograph.files.sources.message_fields import decode_json, parse_arrival
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.sources import Sources
+from heliograph.model.checks.refusal_reasons import RefusedError
+from heliograph.numerics.check import InputError, fail, instance, show_value
+from heliograph.numerics.times.timestamp_order import YEAR
+from heliograph.serving.brokers.transport import LOG
+from heliograph.serving.message import LONGEST, Message, UnreadMessage
+from heliograph.simulation.network import Network
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+MICROSECOND = timedelta(microseconds=1)
+LISTED = 8  # unknown topics in one line
+REMEMBERED = 10_000  # times of messages without a count
+NAME = 200  # characters of a plant's name
+
+
+class Translator:
+    """Sources of a network, applied to messages as they come.
+
+    A measurement without a time is of the moment of its arrival, and counted here. Where a time names it but no count,
+    those of a node with one time are told apart by their order; of a broker, which may send a message again, one with
+    the same values is the same message. A message that a broker had stored for new subscribers is left out where only
+    its arrival would date it. A stamp that is more than a year before a known arrival is refused. Unknown topics are
+    counted, never guessed.
+
+    Args:
+        table: sources by topic, as in a network's file.
+        network: the network.
+        others: nodes that other processes are, whose messages are left out.
+
+    Raises:
+        ValueError: sources that do not fit the network.
+    """
+
+    def __init__(self, table: object, network: Network, others: Collection[str] = ()):
+        """Check a table of sources by topic against the network; `others`: nodes whose messages are left out."""
+        instance("network", network, Network, "a Network")
+        if isinstance(others, str) or not isinstance(others, Collection):
+            raise fail("nodes of other processes", "a list of names", show_value(others))
+        self.sources = Sources(table, network, others)
+        topics = self.sources.topics
+        # The only topic, if there is one, and it is no pattern (with the wildcards + or #).
+        is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
+        self._alone = topics[0] if is_alone else None
+        self._counts, self._stored = Counter[tuple[str, str]](), 0
+        # Values of the newest times of each plant and node without a count.
+        self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
+
+    def read(
+        self, topic: str, payload: bytes, arrival: datetime, stored: bool = False
+    ) -> list[Message | UnreadMessage | str]:
+        """Return the messages in a payload of a topic, or the reason why it cannot be read; [] of unknown topics.
+
+        Args:
+            topic: the topic.
+            payload: JSON.
+            arrival: when it arrived.
+            stored: whether the broker had stored it for new subscribers.
+        """
+        return self._read_payload(topic, payload, arrival, stored, repeatable=True, where=topic)
+
+    def topic_of(self, path: Path | None) -> str | None:
+        """Return the topic of messages that name none: that of their file, or the only one; None if there is neither.
+
+        Args:
+            path: the file; None of a pipe.
+        """
+        names = () if path is None else (path.name, make_default_topic(path))
+        return next((name for name in names if name in self.sources.topics), self._alone)
+
+    def topic_of_rows(self, path: Path | None, header: Sequence[str]) -> str | None:
+        """Return the topic of the rows of a table; None of one that the sources do not know.
+
+        Args:
+            path: the file; None of a pipe.
+            header: the names of the columns.
+        """
+        topic = self.topic_of(path)
+        if topic is None or (path is not None and topic in (path.name, make_default_topic(path))):
+            return topic
+        fields = [field for mapped in self.sources.of(topic) for field in mapped.source.fields]
+        return topic if all(field in header or field.split(".")[0] in header for field in fields) else None
+
+    def decode(self, message: FileMessage, topic: str | None) -> list[Message | UnreadMessage | str]:
+        """Return the messages in a line or a row, or why it cannot be read; [] of unknown topics.
+
+        It arrived when it says so; else when it was measured, or now if that is later than now.
+
+        Args:
+            message: the line or the row.
+            topic: topic of one that names none.
+        """
+        name = topic if message.topic is None else message.topic
+        if name is None:
+            return [str(fail(message.where, "a message in our own form, or a topic of the sources", "neither"))]
+        try:
+            arrival = None
+            if message.arrival is not None:
+                arrival = convert_nanoseconds_to_date(parse_arrival(message.arrival, f"{message.where}, arrival"))
+        except InputError as error:
+            return [str(error)]
+        return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
+
+    def left_out(self) -> list[str]:
+        """Return lines on messages that were not used: of unknown topics, and stored ones."""
+        lines, unknown = [], +self.sources.unknown
+        if unknown:
+            named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
+            more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
+            lines.append(f"topics that are not among the sources: {named}{more}")
+        lines += [*self.sources.notes, *self.sources.senders.describe_several_senders()]
+        if said := self.sources.describe_absent_field():
+            lines.append(f"a field that no message had: {said}")
+        if self._stored:
+            lines.append(f"{self._stored} stored messages were left out: without time= they have no date")
+        return lines
+
+    def _read_payload(
+        self, topic: str, payload: object, arrival: datetime | None, stored: bool, repeatable: bool, where: str
+    ) -> list[Message | UnreadMessage | str]:
+        """Return the messages in a payload, and for each reading that cannot be used the reason.
+
+        The reason is an UnreadMessage where node and count of the reading are known, else a text.
+
+        Args:
+            topic: where it came from.
+            payload: as the broker gave it.
+            arrival: when it came, None for now.
+            stored: the broker had kept it, so that it is left out where it has no time of its own.
+            repeatable: whether a copy of it may come again, so that its number is made from what it says.
+            where: place that an error names.
+        """
+        results: list[Message | UnreadMessage | str] = []
+        try:
+            # A message that only says that a sender is online or offline has no readings: the sources note it.
+            if self.sources.take_device_word(topic, payload, where):
+                return []
+            # Messages of unknown topics are counted, whatever they carry.
+            if not self.sources.of(topic):
+                self.sources.unknown[topic] += 1
+                return []
+            content = _decode_json(payload, where)
+            for reading in self.sources.read(topic, content, where):
+                if isinstance(reading, Unread):
+                    results.append(self._explain_unread(where, reading, arrival, repeatable))
+                elif stored and reading.time is None:  # only its arrival would date it
+                    self._stored += 1
+                else:
+                    results.append(self._make_message(where, reading, arrival, repeatable))
+                    self._watch_for_several_senders(topic, reading, content)
+        except InputError as error:
+            results.append(str(error))
+        return results
+
+    def _watch_for_several_senders(self, topic: str, reading: Reading, content: object) -> None:
+        """Note the fields of a message, by which several senders of one node can be told; warn of them now and then."""
+        senders = self.sources.senders
+        senders.note_fields(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
+        for line in senders.describe_at_powers_of_two_messages():
+            LOG.warning("%s", line)
+
+    def _explain_unread(
+        self, topic: str, unread: Unread, known: datetime | None, repeatable: bool
+    ) -> UnreadMessage | str:
+        """Return why a message could not be read, with its node, count and time where these were."""
+        why = str(unread.error)
+        if unread.counted is None:
+            return why
+        try:
+            message = self._make_message(topic, unread.counted, known, repeatable)
+            reason = unread.error.reason if isinstance(unread.error, RefusedError) else None
+            return UnreadMessage(message, why, reason, counted=unread.counted.sequence is not None)
+        except InputError:
+            return why
+
+    def _make_message(self, topic: str, reading: Reading, known: datetime | None, repeatable: bool) -> Message:
+        """Return the message of a reading, with a number if it has no count.
+
+        Args:
+            topic: where it came from, for errors.
+            reading: what the sources read.
+            known: when it arrived; None if it is not known, and is taken to be now.
+            repeatable: whether a copy of it may come again.
+        """
+        if len(reading.plant) > NAME or "\0" in reading.plant:
+            expected = f"a name of at most {NAME} characters, without NUL"
+            raise fail(f"{topic}, plant", expected, show_value(reading.plant))
+        arrival = datetime.now(UTC) if known is None else known
+        nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
+        reading = self.sources.date_copy_as_original(reading, nanoseconds)
+        time = self._date_reading(topic, reading, arrival, is_known=known is not None)
+        # A message from a log says when it arrived. One that comes now says so only if its time is later than now: it
+        # cannot have been measured after it came.
+        stated_arrival: datetime | None = None
+        if reading.time is not None and isinstance(time, datetime):
+            is_from_log = known is not None and not repeatable
+            stated_arrival = arrival if time > arrival or is_from_log else None
+        # Made without a check: the parts are checked already, and dates are no texts here. NaN becomes None.
+        return Message.model_construct(
+            plant=reading.plant,
+            node=reading.node,
+            sequence=self._count_reading(reading, repeatable),
+            time=time,
+            values=[None if value != value else value for value in reading.values.tolist()],
+            inputs=None,
+            arrival=stated_arrival,
+        )
+
+    def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
+        """Return when a reading was measured: a date, or a number of steps; without a time, when it arrived.
+
+        Raises ValueError, which names the topic, at a date of more than a year before a known arrival.
+        """
+        if reading.time is None:
+            return arrival
+        if self.sources.time_counts_steps and self.sources.step_seconds is None:
+            return float(reading.time)
+        time = convert_nanoseconds_to_date(reading.time)
+        is_unset = is_known and (arrival - time) // MICROSECOND * 1000 > YEAR  # a clock that was never set
+        if is_unset:
+            expected = f"a time that was set, near that of arrival, {arrival.isoformat()}"
+            raise fail(f"{topic}, time", expected, time.isoformat())
+        return time
+
+    def _count_reading(self, reading: Reading, repeatable: bool) -> int:
+        """Return a reading's own count, or else a number: among those of its node and time, or of its node.
+
+        `repeatable`: whether a copy of it may come again, which gets the same number.
+        """
+        if reading.sequence is not None:
+            return reading.sequence
+        name = reading.plant, reading.node
+        number = self._counts[name]  # of all readings of this node before
+        self._counts[name] += 1
+        if reading.time is not None:
+            number = self._number_among_simultaneous(reading, repeatable)
+        return number
+
+    def _number_among_simultaneous(self, reading: Reading, repeatable: bool) -> int:
+        """Return the sequence number of a message without a count: how many of its node and time came before it.
+
+        A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
+        """
+        assert reading.time is not None
+        values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
+        mine = reading.values.tobytes()
+        if repeatable and mine in values:
+            return values.index(mine)
+        values.append(mine)
+        if len(self._uncounted) > REMEMBERED:
+            self._uncounted.popitem(last=False)
+        return len(values) - 1
+
+
+def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
+    """Return a date, to the microsecond, from nanoseconds since 1970.
+
+    Raises:
+        ValueError: beyond the years that dates have.
+    """
+    try:
+        return EPOCH + timedelta(microseconds=nanoseconds // 1000)
+    except OverflowError:
+        raise fail("time", "a date of these thousand years", nanoseconds) from None
+
+
+def _decode_json(payload: object, where: str) -> object:
+    """Return the content of a payload of JSON; what is read already, as a row's columns, as it is."""
+    if not isinstance(payload, bytes | str):
+        return payload
+    if len(payload) > LONGEST:
+        raise fail(where, f"at most {LONGEST} bytes", len(payload))
+    return decode_json(payload, where)

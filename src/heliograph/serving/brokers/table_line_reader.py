@@ -1,0 +1,212 @@
+"""Lines of a table of CSV that come through a pipe, to messages: rows of time, events, and rows that sources map."""
+
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.files.csv_columns import CsvColumnReader
+from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
+from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnMessageReader
+from heliograph.files.recording import RowReader
+from heliograph.files.recording_rows import RecordingRows, join_recording_rows
+from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.text.csv_dialects import COMMENTS, guess_names_in_header
+from heliograph.files.text.csv_text import ANNOTATIONS, CsvReader, CsvRow
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.check import InputError
+from heliograph.serving.brokers.replay import check_time_steps, encode_event, events_of_recording, row_events
+from heliograph.serving.brokers.source_translator import Translator, convert_nanoseconds_to_date
+from heliograph.serving.brokers.transport import LOG
+from heliograph.serving.message import Message, Payload, UnreadMessage
+from heliograph.simulation.network import Network
+
+SECOND = np.timedelta64(1_000_000_000, "ns")
+
+
+class TableLineReader:
+    """Reads lines of a table of CSV as messages; its header says what the rows are, as in a file.
+
+    Args:
+        network: the network.
+        translator: the sources of the network's file; None if it has none.
+        path: the file that is redirected, whose name may be a topic; None of any other pipe.
+        ignore_unknown: whether columns that the network does not know are left out.
+    """
+
+    def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
+        self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
+        self._source = "standard input" if path is None else str(path)
+        self._text = CsvReader(self._source, path, marked=translator is not None)
+        self._reader: MessageRowReader | TimeRowReader | None = None
+
+    def names_columns(self, line: str) -> bool:
+        """Return whether a line is the first of a table: it names a column that the network or its sources know."""
+        text = line.strip()
+        if not text or text[0] in "[{" or not (names := guess_names_in_header(text)):
+            return False
+        if text.startswith(ANNOTATIONS):
+            return True
+        rows = RowReader(self._network, self._source, strict=False, ignore_unknown=False)
+        known = {*OWN, TOPIC, PAYLOAD, *rows.names}
+        fields = set() if self._translator is None else self._translator.sources.columns
+        # A single word is a table's only column if a comment sign stands before it; else it may be anything.
+        is_header = len(names) > 1 or text.startswith(COMMENTS)
+        return is_header and bool(names & (known | fields))
+
+    def read(self, lines: Sequence[str]) -> list[Payload]:
+        """Return the messages of lines.
+
+        Raises:
+            ValueError: a header that names no columns, or others than expected; one line.
+        """
+        return self._read_rows([row for line in lines for row in self._text.add(f"{line}\n")])
+
+    def end(self) -> list[Payload]:
+        """Return the messages of what is left at the end."""
+        rest = self._read_rows(self._text.end())
+        return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
+
+    def _read_rows(self, rows: list[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows of text; the header chooses their reader."""
+        if self._reader is None and self._text.header:
+            self._reader = self._choose_reader(self._text.header)
+        return [] if self._reader is None or not rows else self._reader.read(rows)
+
+    def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
+        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
+        if {NODE, SEQUENCE} <= set(header):
+            own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
+            return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
+        translator = self._translator
+        if translator is not None:
+            topic = translator.topic_of_rows(self._path, header)
+            if topic is not None or TOPIC in header:
+                return MessageRowReader(
+                    lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
+                )
+        return TimeRowReader(self._network, header, self._text, self._ignore)
+
+
+class MessageRowReader:
+    """Reads rows by themselves: each is a message, or several, in our own form or by the sources' map."""
+
+    def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
+        self._decode = decode
+
+    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows, and why others cannot be read."""
+        return [
+            payload for row in rows for payload in ([str(row)] if isinstance(row, InputError) else self._decode(row))
+        ]
+
+
+class TimeRowReader:
+    """Reads rows of time, each with the measurements of all nodes, as `heliograph run` reads them.
+
+    Those of a pipe are messages at once; those of a file at its end, when all rows can be put in order.
+    """
+
+    def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
+        """Prepare to read rows of a table with these columns; `text`: where they come from, a file or another pipe."""
+        self._network, self._steps = network, TIME_STEP not in network.inputs  # the latter: time counts steps
+        self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
+        self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)
+        self._columns.header = header
+        self._given = [name for name in network.inputs if name != TIME_STEP]
+        self._origin: np.datetime64 | None = None  # date of the first row, from which times are counted
+        self._before: float | None = None  # time of the row before
+        self._is_file = text.path is not None
+        self._cells = list[RecordingRows]()  # those of a file, until it ends
+
+    def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
+        """Return the messages of rows, as a replay of them has them, and why others cannot be read.
+
+        Those of a file are kept until its end, and only the latter returned.
+        """
+        cells = self._rows.read_cells(self._columns.read(rows))
+        refused, self._rows.refused = [str(error) for error in self._rows.refused], []
+        count = len(cells.numbers)
+        if not count or self._is_file:
+            self._cells += [cells] if count else []
+            return [*refused]
+        time = self._time_of_messages(cells.time, cells.numbers)
+        if TIME_STEP in cells.inputs:
+            self._check_time_steps(cells, time)
+        inputs = np.stack([cells.inputs[name] for name in self._given], axis=1) if self._given else np.zeros((count, 0))
+        events = row_events(cells.numbers - 1, time, inputs, cells.measurements, self._before, self._steps)
+        lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
+        self._before = float(time[-1])
+        return [*lines, *refused]
+
+    def _check_time_steps(self, cells: RecordingRows, time: np.ndarray) -> None:
+        """Raise ValueError where a row's time step is not the time since the row before; `time`: times of the rows.
+
+        With the time of the row before them, the first step can be checked too. The check takes no step and no number
+        of that row, in whose place those of the first row stand.
+        """
+        before = [] if self._before is None else [self._before]
+        steps = cells.inputs[TIME_STEP]
+        check_time_steps(
+            np.concatenate([steps[: len(before)], steps]),
+            np.concatenate([before, time]),
+            np.concatenate([cells.numbers[: len(before)], cells.numbers]),
+            self._rows.source,
+        )
+
+    def end(self) -> list[Payload]:
+        """Return the messages of the rows of a file."""
+        if not self._cells:
+            return []
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always", UserWarning)
+            recording, self._cells = self._rows.arrange_recording(join_recording_rows(self._cells)), []
+        for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
+            LOG.warning("%s", line)
+        events, origin = events_of_recording(recording, self._network)
+        lines = [json.dumps(encode_event(event, "", origin)).encode() for event in events]
+        return [*lines, *(str(error) for error in self._rows.refused)]
+
+    def _time_of_messages(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return the times in the unit of messages: steps, numbers, or seconds since the first date."""
+        if self._steps:
+            return np.asarray(numbers - 1.0)
+        if time.dtype.kind != "M":
+            return np.asarray(time, dtype=float)
+        self._origin = time[0] if self._origin is None else self._origin
+        return np.asarray((time - self._origin) / SECOND)
+
+
+def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
+    """Return the messages of an event in our own form, or why it cannot be read, with its count and time if known."""
+    try:
+        found = reader.read(where, content)
+    except InputError as error:
+        return [str(error)]
+    payloads = list[Payload]()
+    for reading, arrival in found:
+        if not isinstance(reading, Unread):
+            payloads.append(_make_message(reader, reading, arrival))
+        elif reading.counted is not None:
+            payloads.append(UnreadMessage(_make_message(reader, reading.counted, arrival), str(reading.error)))
+    return payloads
+
+
+def _make_message(reader: OwnMessageReader, reading: Reading, arrival: float) -> Message:
+    """Return the message of an event; it has no arrival where that is the time of the measurement."""
+    assert reading.time is not None
+    time = reading.time if reader.numbers else convert_nanoseconds_to_date(int(reading.time))
+    stated_arrival = None
+    if arrival != reading.time:
+        stated_arrival = arrival if reader.numbers else convert_nanoseconds_to_date(int(arrival))
+    return Message.model_construct(
+        plant=reading.plant,
+        node=reading.node,
+        sequence=reading.sequence,
+        time=time,
+        values=[None if value != value else value for value in reading.values.tolist()],
+        inputs=None,
+        arrival=stated_arrival,
+    )

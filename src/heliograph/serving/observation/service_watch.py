@@ -1,0 +1,351 @@
+"""Observation of running services: estimates with their bands, links, running tests of covariances, and warnings."""
+
+import threading
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from time import monotonic
+from typing import Any, NamedTuple
+
+from prometheus_client import CollectorRegistry
+from pydantic_core import from_json
+
+from heliograph.disk.quoted_text import join_names
+from heliograph.fusion.network_fusion import Fusion
+from heliograph.model.checks.refusal_reasons import OF_NODES, WORDS
+from heliograph.model.estimate import Claim
+from heliograph.model.plant import TIME_STEP
+from heliograph.numerics.types import unit_of, units_in
+from heliograph.report.outputs import RecentOutputs, make_output_row
+from heliograph.serving.count_totals import FIELDS, CountTotals, list_counts_of_link
+from heliograph.serving.observation.answers_between_batches import LastAnswers
+from heliograph.serving.observation.remembered_plants import PLANTS, BatchHistograms, RememberedPlants
+from heliograph.serving.observation.running_nis import MEMORY, RunningNis, read_nis
+from heliograph.serving.observation.trouble_overview import PlantTroubles, TroubleOverview
+from heliograph.serving.observed_service import BatchTimes, ObservedService, WatchableService, WatchedPlant
+from heliograph.serving.output import Output
+from heliograph.simulation.network import Network
+
+LISTED = 1000  # plants that can be chosen from
+WARNINGS = 50  # lines
+APART = 3  # nodes that have a warning each; more of the same kind have one together
+REFUSED = "late", "future", "implausible", "conflict"
+COUNTED: dict[str, str] = {  # of a node's messages
+    "late": "came too late to be used; a longer --window would hold what they change",
+    "future": "of a time that is not yet, refused; its clock is wrong",
+    "implausible": "implausible and refused; the refused lines say why",
+    **{reason: f"refused, {WORDS[reason]}" for reason in OF_NODES},
+    "held": "times equal for longer than its noise allows: it is stuck, or has no noise",
+    "timeouts": "times silent for longer than its timeout, and back",
+    "conflict": "came again with other values; the first stayed",
+}
+
+
+class ServiceAnswers(NamedTuple):
+    """What services answer between batches: names of all plants, one plant's counts by node, and counts of all."""
+
+    names: list[str]
+    links: dict[str, dict[str, int]]
+    malformed: int
+    wrong: int
+
+
+class ServiceWatch:
+    """Observer of any number of services of one network; a call from another thread waits for the current batch.
+
+    Args:
+        states: names of the states; a name with a `unit` has it on the axes.
+        title: name of the network.
+        time_unit: unit of times that are numbers.
+        fused: by the name of a fusion its claim, and the (node, filter) pairs that it fuses, by which it is judged.
+        names: names of the received numbers by node and filter.
+        uncounted: nodes whose messages carry no count: how many are lost is not known, and None.
+    """
+
+    def __init__(
+        self,
+        states: Sequence[str],
+        title: str = "",
+        time_unit: str = "",
+        fused: Mapping[str, tuple[Claim, Sequence[tuple[str, str]]]] | None = None,
+        names: Mapping[tuple[str, str], Sequence[str]] | None = None,
+        uncounted: Collection[str] = (),
+    ):
+        """Begin without a service.
+
+        Args:
+            states: names of the states.
+            title: name of the network.
+            time_unit: unit of times that are numbers.
+            fused: by the name of a fusion its claim, and the (node, filter) pairs that it fuses.
+            names: names of the received numbers by node and filter.
+            uncounted: nodes whose messages carry no count.
+        """
+        self.states, self.title, self.time_unit = list(states), title, time_unit
+        self.fused, self.uncounted = dict(fused or {}), uncounted
+        # `lock` is held while a batch is taken, `_noting` while its outputs are recorded. Then: when the batch that is
+        # being taken began.
+        self.lock, self._noting = threading.Lock(), threading.Lock()
+        self._batch_started: float | None = None
+        # Of all plants together: services, tests of claims, weighed outputs, counts, what is wrong, batches.
+        self.services: list[WatchableService] = []
+        self.nis: dict[tuple[str, str], RunningNis] = {}
+        self.outputs = RecentInnovations(MEMORY, names or {})
+        self.totals, self._overview = CountTotals(), TroubleOverview()
+        no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
+        self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)
+        self._batches = BatchHistograms()
+        # Of each plant with a new message.
+        self._memory = RememberedPlants(names or {})
+
+    @property
+    def registry(self) -> CollectorRegistry:
+        """Return the registry of the metrics that are counted here, to which the page adds others."""
+        return self._batches.registry
+
+    def wrap(self, service: WatchableService) -> "ObservedService":
+        """Wrap a service so that its batches are observed."""
+        self.services.append(service)
+        return ObservedService(service, self)
+
+    @contextmanager
+    def taking_batch(self) -> Iterator[None]:
+        """Hold the lock while a batch is taken, so that no page sees half of it; note when it began, for `busy`."""
+        with self.lock:
+            self._batch_started = monotonic()
+            try:
+                yield
+            finally:
+                self._batch_started = None
+
+    def note(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
+        """Record the outputs and statistics of a batch, `last`; None where nothing came."""
+        with self._noting:
+            self._record_batch(outputs, last)
+
+    def _record_batch(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
+        """Update times, counts, points and tests by a batch's outputs; call it with `_noting` held."""
+        if last is not None:
+            self._batches.observe(last)
+        plants = {output.plant for output in outputs}
+        for name, plant in self._iterate_plants(plants):
+            self.totals.add_plant(name, plant.links)
+        for name in plants:
+            self._overview.note_change(name)
+        for output in outputs:
+            if output.kind in ("provisional", "final"):
+                message = from_json(output.body)
+                self._memory.keep_point(output.plant, message)
+                if output.kind == "provisional":
+                    self._memory.keep_crossings(output.plant, message.get("forecast", []))
+                else:
+                    self._test_claims(output.plant, message["estimates"])
+
+    def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add the NIS of a plant's newest estimates to the running tests, and weighed outputs to the recent ones.
+
+        Each to those of the plant, and to those of all plants. `estimates`: messages by node and filter.
+        """
+        tests_of_plant, outputs_of_plant = self._memory.tests_of(plant), self._memory.outputs_of(plant)
+        for node, filters in estimates.items():
+            for name, message in filters.items():
+                squared, received = read_nis(message)
+                if squared is not None:
+                    for tests in (self.nis, tests_of_plant):
+                        tests.setdefault((node, name), RunningNis(message["claim"])).add(squared, received)
+                if message.get("outputs") and message.get("received"):
+                    for outputs in (self.outputs, outputs_of_plant):
+                        outputs.add(node, name, message["outputs"])
+
+    def crossings(self, most: int) -> list[tuple[tuple[str, ...], float]]:
+        """Return ((plant, node, filter, threshold, how far ahead), probability that it is crossed by then).
+
+        Of `most` plants at most, those in which a crossing is most probable.
+        """
+        with self._noting:
+            return self._memory.list_crossings(most)
+
+    def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
+        """Yield all plants of all services."""
+        for service in self.services:
+            yield from service.plants.items()
+
+    def _iterate_plants(self, names: Collection[str]) -> Iterator[tuple[str, WatchedPlant]]:
+        """Yield the plants of these names."""
+        for service in self.services:
+            yield from ((name, service.plants[name]) for name in names if name in service.plants)
+
+    def links(self) -> dict[str, dict[str, int | None]]:
+        """Sum the counts over all plants, by node: messages by verdict, lost ones, and what was refused.
+
+        Also of plants that have left the memory.
+        """
+        return self._hide_uncounted(self.totals.as_table())
+
+    def _hide_uncounted(self, links: Mapping[str, dict[str, int]]) -> dict[str, dict[str, int | None]]:
+        """Return counts by node with None for the lost messages of nodes that do not count theirs."""
+        return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
+
+    def list_worst_plants(self) -> list[PlantTroubles]:
+        """Return the plants with something wrong, the worst first."""
+        refused = dict[str, str]()
+        for name, plant in self._iterate_plants(self._overview.touched):
+            counts = [
+                (node, verdict, getattr(link, verdict)) for node, link in plant.links.items() for verdict in REFUSED
+            ]
+            refused[name] = "; ".join(f"{node}: {count:,} {verdict}" for node, verdict, count in counts if count)
+        return self._overview.list_worst_plants(self._memory.tests, self._memory.dead_senders, refused)
+
+    def tests(self, plant: str) -> Mapping[tuple[str, str], RunningNis]:
+        """Return the running tests of a plant's claims, by node and filter; none of a plant that is forgotten."""
+        return self._memory.tests.get(plant, {})
+
+    def busy(self) -> float:
+        """Return for how many seconds the present batch is being taken; 0 where there is none."""
+        begun = self._batch_started
+        return 0.0 if begun is None else monotonic() - begun
+
+    def dead_senders(self) -> Mapping[str, int]:
+        """Count the plants that have a dead sender, by node with a trigger, over all services."""
+        total = Counter[str]()
+        for service in self.services:
+            total.update(service.dead_senders())  # adds, and holds zeros
+        return total
+
+    def remarks(self) -> Mapping[tuple[str, str], int]:
+        """Count how often filters changed a state as users should know, by node and filter, over all services."""
+        total = Counter[tuple[str, str]]()
+        for service in self.services:
+            total.update(service.remarks())
+        return total
+
+    def make_page_data(self, plant: str | None, since: int = 0) -> dict[str, Any]:
+        """Return the data of the page for a plant (None: the one with the newest message), after the point `since`.
+
+        While a batch is being taken, as where programs compile, the counts are those before it.
+        """
+        with self._noting:
+            name = self._memory.newest_plant if plant is None else plant
+        # Asked without holding `_noting`, since it may take the other lock.
+        answers = self._service_answers.ask(name)
+        with self._noting:
+            # One JSON object; lists are bounded, so that its size does not grow with the plants.
+            return {
+                "title": self.title,
+                "count": len(answers.names),
+                "plants": answers.names[:LISTED],
+                "plant": name,
+                "states": self.states,
+                "units": [unit_of(state) for state in self.states],
+                "time_unit": self.time_unit,
+                "since": since,
+                "malformed": answers.malformed,
+                "all": self.links(),
+                "wrong": answers.wrong,
+            } | self._describe_plant(name, since, answers.links)
+
+    def _describe_plant(self, plant: str, since: int, links: Mapping[str, dict[str, int]]) -> dict[str, Any]:
+        """Return what the page says of one plant, whose counts by node are `links`, after the point `since`."""
+        memory = self._memory
+        tests, senders = memory.tests.get(plant, {}), memory.senders.get(plant, {})
+        health = memory.outputs[plant].summarise_outputs() if plant in memory.outputs else []
+        return {
+            "newest": memory.count,
+            "points": [point._asdict() for point in memory.points.get(plant, ()) if point.number > since],
+            "links": self._hide_uncounted(links),
+            "senders": senders,
+            "tests": [_make_test_row(*key, test) for key, test in tests.items()] + self.judge_fusions(tests),
+            "outputs": [make_output_row(output) for output in health],
+            "levels": [
+                {**dict(zip(("node", "filter", "level", "ahead"), key, strict=True)), **probabilities}
+                for key, probabilities in memory.crossings.get(plant, {}).items()
+            ],
+            "warnings": list(self._yield_warnings(links, tests, senders))[:WARNINGS],
+        }
+
+    def _ask_services(self, plant: str) -> ServiceAnswers:
+        """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
+        every = list(self.plants())
+        return ServiceAnswers(
+            names=sorted(name for name, _ in every),
+            links=_add_counts([status for name, status in every if name == plant]),
+            malformed=sum(service.malformed for service in self.services),
+            wrong=len(self.list_worst_plants()),
+        )
+
+    def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
+        """Return a row for each fusion without a NIS test of its own: in doubt if that of any estimate it fuses is.
+
+        `by` names the estimates that are in doubt, else all that were tested.
+        """
+        rows: list[dict[str, object]] = []
+        for name, (claim, parts) in self.fused.items():
+            tested = [(source, tests[source]) for source in parts if source in tests]
+            has_own_test = (Network.FUSED, name) in tests
+            if not tested or has_own_test:
+                continue
+            doubted = ["/".join(source) for source, test in tested if test.explain_doubt()]
+            numbers = {"ratio": None, "low": None, "high": None, "numbers": sum(test.numbers for _, test in tested)}
+            judged = {"doubt": bool(doubted), "by": doubted or ["/".join(source) for source, _ in tested]}
+            rows.append({"node": Network.FUSED, "filter": name, "claim": claim, **numbers, **judged})
+        return rows
+
+    def _yield_warnings(
+        self,
+        links: Mapping[str, Mapping[str, int]],
+        tests: Mapping[tuple[str, str], RunningNis],
+        senders: Mapping[str, Mapping[str, Any]],
+    ) -> Iterator[str]:
+        """Yield what is wrong with a plant, a line each: doubted filters, dead senders, then messages by count."""
+        for (node, filter_name), test in tests.items():
+            if doubt := test.explain_doubt():
+                yield f"{node}/{filter_name}: {doubt}"
+        for node, sender in senders.items():
+            if sender["dead"]:
+                yield f"{node}: its sender is dead: {sender['reason']}"
+        for name, words in COUNTED.items():
+            counted = sorted(node for node in links if links[node][name])
+            # A line for each node, or one for many.
+            for nodes in [counted] if len(counted) > APART else [[node] for node in counted]:
+                yield f"{join_names(nodes)}: {sum(links[node][name] for node in nodes):,} {words}"
+
+
+def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
+    """Sum the counts of several plants, by node."""
+    results: dict[str, dict[str, int]] = {}
+    for plant in plants:
+        for node, link in plant.links.items():
+            tally = results.setdefault(node, dict.fromkeys(FIELDS, 0))
+            for name, count in list_counts_of_link(link).items():
+                tally[name] += count
+    return results
+
+
+def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
+    """Return one row of the page's table of tests."""
+    low, high = test.band()
+    names = {
+        "node": node,
+        "filter": filter_name,
+        "claim": test.claim,
+        "doubt": test.explain_doubt() is not None,
+        "by": [],
+    }
+    return names | {"ratio": test.ratio, "low": low, "high": high, "numbers": test.numbers}
+
+
+def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> ServiceWatch:
+    """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `ServiceWatch`."""
+    claims = network.claims()
+    fused = {
+        name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
+        for name, fusion in network.fused.items()
+        if isinstance(fusion, Fusion)
+    }
+    names: dict[tuple[str, str], Sequence[str]] = {
+        (node, name): receiver.received_names for node, receiver in network.nodes.items() for name in receiver.filters
+    }
+    all_names = [f"{node}: {name}" for node, receiver in network.nodes.items() for name in receiver.received_names]
+    names |= {(Network.FUSED, name): all_names for name in network.fused}
+    unit = units_in(network.inputs).get(TIME_STEP, "s") if TIME_STEP in network.inputs else "steps"
+    return ServiceWatch(network.states, title, time_unit=unit, fused=fused, names=names, uncounted=uncounted)

@@ -1,0 +1,158 @@
+"""Silence of senders, told by the clock: it follows from the last commit, and is not committed."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
+from math import floor, inf
+from time import monotonic
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.live.fleet import Fleet
+from heliograph.live.plant_state import PlantState
+from heliograph.live.sorted_rows import HeldRow
+from heliograph.serving.settings import SHORTEST
+
+MOVED = 0.1  # deviations by which a mean has to move to be published again, and share by which a deviation has to
+GRACE = 10.0  # seconds after a start in which messages that waited come first
+
+
+class PublishedEstimate(NamedTuple):
+    """The newest estimate of a plant that was published.
+
+    Attributes:
+        outputs: outputs of all filters, (outputs,).
+        dead: nodes whose senders were dead then.
+        time: the row's, in steps or in the unit of dt.
+    """
+
+    outputs: np.ndarray
+    dead: tuple[str, ...]
+    time: float
+
+
+class SilenceWatch:
+    """Finds silent plants whose steps have dates, and which of their estimates are worth publishing.
+
+    An estimate is published where a mean has moved by a tenth of its deviation since the last one published, a
+    deviation by a tenth of itself, or a sender is dead now, or is not any more; and every so many seconds if asked for.
+
+    Args:
+        fleet: the plants of the network.
+        every: seconds after which an estimate is published although it has hardly changed; None for never.
+    """
+
+    def __init__(self, fleet: Fleet, every: float | None):
+        """Begin with nothing published; `every`: seconds after which an estimate is published again; None for never."""
+        self.fleet, self.every = fleet, every
+        self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last
+        self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest
+        self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
+        # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
+        n, all_columns = len(fleet.network.states), fleet.program.filter_columns
+        self._means = np.array([[each.mean + i for i in range(n)] for each in all_columns], dtype=int)
+        self._variances = np.array(
+            [[each.covariance + i * (n + 1) for i in range(n)] for each in all_columns], dtype=int
+        )
+
+    def resume(self, names: Iterable[str]) -> None:
+        """Note plants that a service goes on with, of which messages may wait somewhere."""
+        self._resumed.update(names)
+
+    def find_plants_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+        """Return the plants of which another step has begun by now without a message, with its number."""
+        step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
+        if step is None or not self.fleet.deciding:
+            return due
+        for plant, origin in self._iterate_dated_plants(plants):
+            passed = min((now - origin) // timedelta(seconds=step), self.fleet.end_step)
+            # The clock also confirms or contradicts a leap in time that no other clock has confirmed so far.
+            leap = plant.leap
+            has_open_leap = leap is not None and leap.now > -inf and not leap.believed
+            has_new_step = passed > plant.rows.held[-1].key[0]
+            if passed > plant.confirmed and (has_open_leap or has_new_step):
+                due.append((plant, float(passed)))
+        return due
+
+    def find_plants_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
+        """Return the plants of which a sender has been silent for longer than its timeout since it was told last.
+
+        With the present moment by the clock: its step, or the time where time is continuous.
+        """
+        if self.fleet.shortest_timeout == inf:
+            return []
+        self._looked = monotonic()
+        step, found = self.fleet.options.step, list[tuple[PlantState, float]]()
+        for plant, origin in self._iterate_dated_plants(plants):
+            at = (now - origin) / timedelta(seconds=step or 1.0)
+            at = at if step is None else min(floor(at), self.fleet.end_step)
+            newly_dead = set(self._dead_senders(plant, at)) - set(self._published_dead_senders(plant))
+            if at > plant.now and newly_dead:
+                found.append((plant, float(at)))
+        return found
+
+    def looks_between_batches(self, lag: float) -> bool:
+        """Return whether to look for timeouts after a batch that came so many seconds late: once a second, if in time.
+
+        Where messages wait for longer than a timeout, a sender is silent since its messages wait.
+        """
+        in_time = lag < self.fleet.shortest_timeout * (self.fleet.options.step or 1.0) < inf
+        return in_time and monotonic() > self._looked + SHORTEST
+
+    def _iterate_dated_plants(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
+        """Yield the plants whose time is a date's, with their origins; not those of which messages may wait."""
+        if self._resumed and monotonic() > self._begun + GRACE:
+            self._resumed.clear()
+        for plant in plants:
+            if plant.origin is not None and plant.name not in self._resumed:
+                yield plant, plant.origin
+
+    def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
+        """Note that the estimates after these rows were published."""
+        if self.fleet.watched:
+            outputs = self.fleet.outputs([row.slot for _, row in rows])
+            for (plant, row), output in zip(rows, outputs, strict=True):
+                self._published[plant.name] = PublishedEstimate(output, self._dead_senders(plant), row.key[0])
+                self._resumed.discard(plant.name)
+
+    def forget_plant(self, name: str) -> None:
+        """Forget a plant that leaves the memory."""
+        self._published.pop(name, None)
+
+    def select_for_publication(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[tuple[PlantState, HeldRow]]:
+        """Return the rows whose estimates differ from what was published, or which are due again."""
+        outputs = self.fleet.outputs([row.slot for _, row in rows])
+        return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_worth_publishing(*pair, output)]
+
+    def _is_worth_publishing(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
+        """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved."""
+        published = self._published.get(plant.name)
+        if published is None or published.dead != self._dead_senders(plant):
+            return True
+        step = self.fleet.options.step or 1.0
+        if self.every is not None and (row.key[0] - published.time) * step >= self.every:
+            return True
+        # Changes of means and deviations (filter, state), compared with the deviations before.
+        deviation_before = np.sqrt(np.maximum(published.outputs[self._variances], 0.0))
+        deviation_now = np.sqrt(np.maximum(output[self._variances], 0.0))
+        mean_change = np.abs(output[self._means] - published.outputs[self._means])
+        deviation_change = np.abs(deviation_now - deviation_before)
+        enough = MOVED * deviation_before
+        return bool(((mean_change > enough) | (deviation_change > enough)).any())
+
+    def _dead_senders(self, plant: PlantState, now: float = -inf) -> tuple[str, ...]:
+        """Return the dead senders of a plant, by now."""
+        return tuple(name for name, status in self.fleet.find_sender_status(plant, now).items() if status.dead)
+
+    def _published_dead_senders(self, plant: PlantState) -> tuple[str, ...]:
+        """Return the senders of a plant that were told to be dead."""
+        return self._published[plant.name].dead if plant.name in self._published else ()
+
+
+def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
+    """Return the dead senders of each plant that has one."""
+    dead = {
+        name: [node for node, status in fleet.find_sender_status(plant).items() if status.dead]
+        for name, plant in (plants.items() if fleet.watched else ())
+    }
+    return {name: nodes for name, nodes in dead.items() if nodes}

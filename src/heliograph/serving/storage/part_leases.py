@@ -1,0 +1,102 @@
+"""Leases of the parts of the plants to processes, in the database that keeps the plants."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sqlalchemy import Column, Connection, Float, Integer, MetaData, String, Table, delete, select, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import Engine
+from sqlalchemy.exc import SQLAlchemyError
+
+from heliograph.numerics.check import fail
+from heliograph.serving.storage.database import is_server_away
+from heliograph.serving.storage.store_protocol import AwayError
+
+TABLES = MetaData()
+PROCESSES = Table("processes", TABLES, Column("name", String(200), primary_key=True), Column("until", Float))
+PARTS = Table(
+    "parts",
+    TABLES,
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("process", String(200)),
+    Column("until", Float),
+)
+NOW = {  # one clock for all: the database's
+    "sqlite": text("SELECT (julianday('now') - 2440587.5) * 86400.0"),
+    "postgresql": text("SELECT extract(epoch FROM clock_timestamp())::float8"),
+}
+TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts are idle
+
+
+class Leases:
+    """Leases a process's share of `parts` parts: all live processes have equally many, up to one.
+
+    A lease makes it likely that one process reads a part at a time, which keeps messages in order. That no message is
+    used twice does not depend on leases or clocks: the commit of a plant fails if another was made since it was read.
+    """
+
+    def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
+        self.engine, self.process, self.parts, self.term = engine, process, parts, term
+        insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
+        self._insert = insert
+        TABLES.create_all(engine)
+
+    def renew(self) -> set[int]:
+        """Report that this process is alive, lease its parts anew, and return the numbers of those that it has now.
+
+        These are the parts that it had, then free ones, up to its fair share.
+
+        Raises:
+            AwayError: the database does not answer now.
+        """
+        with self._raise_if_away(), self.engine.begin() as connection:
+            now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
+            fair = self._report_and_count_fair_share(connection, now)
+            leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
+            held = [(row.number, row.process) for row in connection.execute(leased)]
+            own = [number for number, process in sorted(held) if process == self.process]
+            taken = {number for number, _ in held}
+            free = [number for number in range(self.parts) if number not in taken]
+            return {number for number in (own + free)[:fair] if self._lease(connection, number, now)}
+
+    @contextmanager
+    def _raise_if_away(self) -> Iterator[None]:
+        """Turn the database's error into one line that says it is away, where it is."""
+        try:
+            yield
+        except SQLAlchemyError as error:
+            if not is_server_away(error):
+                raise
+            said = str(getattr(error, "orig", error))
+            raise AwayError(str(fail("leases of parts", "a database that answers", said))) from None
+
+    def release(self, number: int) -> None:
+        """Release one part to other processes."""
+        with self._raise_if_away(), self.engine.begin() as connection:
+            connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
+
+    def leave(self) -> None:
+        """Release everything to other processes."""
+        with self._raise_if_away(), self.engine.begin() as connection:
+            connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
+            connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
+
+    def _report_and_count_fair_share(self, connection: Connection, now: float) -> int:
+        """Report that this process is alive, forget the dead, and return how many parts this one should have.
+
+        The remainder goes to the first processes by name.
+        """
+        connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
+        new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
+        connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
+        alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
+        each, remainder = divmod(self.parts, len(alive))
+        return each + (alive.index(self.process) < remainder)
+
+    def _lease(self, connection: Connection, number: int, now: float) -> bool:
+        """Lease a part if it is ours or free; return whether it is ours now."""
+        mine = {"process": self.process, "until": now + self.term}
+        new = self._insert(PARTS).values(number=number, **mine)
+        free = (PARTS.c.until < now) | (PARTS.c.process == self.process)
+        done = new.on_conflict_do_update(index_elements=["number"], set_=mine, where=free).returning(PARTS.c.number)
+        return connection.execute(done).first() is not None

@@ -1,0 +1,326 @@
+"""Filters in other units: every state, output, measurement and input multiplied by a factor of its own."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian_prediction import OpenLoop
+from heliograph.filters.gaussian.sequential_nodes import SequentialFilter
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.linear.polynomial import PolynomialFilter
+from heliograph.filters.linear.scheduled_gains import LinearSystemFilter
+from heliograph.filters.linear.unconditional_mean import UnconditionalMean
+from heliograph.filters.modes.additive_links import AdditiveModalFilter
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.finite_support_filter import AtomCombinations, MixtureFilter
+from heliograph.filters.modes.jump_linear_filter import ChannelByMode, ModalFilter
+from heliograph.filters.modes.multiple_model import MultipleModelFilter
+from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.modes.uncertain_chain import UncertainModalFilter
+from heliograph.filters.wrappers.fed_back import PredictionFilter
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.over_time import OverTime, at_each_step, first, stack_over_time
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, MatrixOfInputs, Plant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, Sensor
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.moments.monomials import list_exponents
+from heliograph.random_affine.moments.second_moment_map import QuadraticMap
+from heliograph.random_affine.moments.second_moments import SecondOrder, describe_second_moments
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
+
+Modes = TypeVar("Modes", ChannelByPattern, ChannelByMode)  # a channel at one step, mode by mode
+
+# Filters that hold the plant and the sensor at the ends of a channel.
+WithEnds = (
+    LinearFilter
+    | ModalFilter
+    | UncertainModalFilter
+    | AdditiveModalFilter
+    | SideInformationFilter
+    | MultipleModelFilter
+)
+Ended = TypeVar("Ended", bound=WithEnds)
+
+
+class FunctionInUnits(Module):
+    """A function of vectors in other units: out f(x_1 / into_1, ...). Functions in all units share one program."""
+
+    function: Callable[..., ArrayLike]
+    out: np.ndarray
+    into: tuple[np.ndarray, ...]
+
+    def __call__(self, *vectors: jax.Array) -> jax.Array:
+        """Return the function's value in the other units, of vectors in these."""
+        before = (x / factors for x, factors in zip(vectors, self.into, strict=True))
+        return jnp.asarray(self.out) * jnp.asarray(self.function(*before))
+
+
+class Units(NamedTuple):
+    """Factors of the states, of a sensor's outputs, of the measurement and of the inputs.
+
+    In formulas they are the diagonal matrices S (n,), R (p,), Q (m,) and U (u,).
+    """
+
+    states: Float[np.ndarray, " n"]
+    outputs: Float[np.ndarray, " p"]
+    received: Float[np.ndarray, " m"]
+    inputs: Float[np.ndarray, " u"]
+
+
+def rescale_filter(filter: AbstractFilter, units: Units) -> AbstractFilter:
+    """Return the filter of the same model in other units: it estimates S xhat from Q z and U u.
+
+    `filter` estimates xhat from measurements z and inputs u; S, Q and U are the diagonal matrices of the factors of
+    states, measurements and inputs in `units`.
+
+    Raises:
+        ValueError: a filter of an unknown kind.
+    """
+    match filter:
+        case GaussianFilter() | OpenLoop():
+            return _rescale_gaussian(filter, units)
+        case LinearFilter():
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_moments(filter.channel, units))
+        case MixtureFilter():
+            components = _rescale_combinations(filter.components, units)
+            return replace(filter, plant=rescale_plant(filter.plant, units), components=components)
+        case PolynomialFilter(inner=LinearSystemFilter()):
+            assert isinstance(filter.inner, LinearSystemFilter)
+            # A filter of products x x' ...: its monomials are scaled by products of the factors.
+            inner = _rescale_system(filter.inner, filter.degree, units)
+            return PolynomialFilter(inner, filter.degree, filter.endless, _rescale_centre(filter.centre, units))
+        case ModalFilter() | UncertainModalFilter():
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_by_mode(filter.channel, units))
+        case AdditiveModalFilter():
+            return replace(
+                _rescale_plant_and_sensor(filter, units), terms=tuple(_rescale_by_mode(t, units) for t in filter.terms)
+            )
+        case SideInformationFilter(flagged=False) | MultipleModelFilter():
+            return replace(_rescale_plant_and_sensor(filter, units), channel=_rescale_by_mode(filter.channel, units))
+        case PredictionFilter():
+            return PredictionFilter(_require_gaussian(rescale_filter(filter.base, units)))
+        case SequentialFilter():
+            return replace(filter, filters=tuple(_require_gaussian(f) for f in _rescale_parts(filter, units)))
+        case _:
+            raise fail("filter to rescale", "one of the package's that computes covariances", type(filter).__name__)
+
+
+def _rescale_plant_and_sensor(filter: Ended, units: Units) -> Ended:
+    """Return the filter with its plant and its sensor in other units, what is between them as it was."""
+    return replace(filter, plant=rescale_plant(filter.plant, units), sensor=rescale_sensor(filter.sensor, units))
+
+
+def _rescale_gaussian(filter: GaussianFilter | OpenLoop, units: Units) -> GaussianFilter | OpenLoop:
+    """Return a Gaussian filter, or a prediction alone, of S x: initial mean S m, covariance S P S."""
+    s = units.states
+    started = replace(
+        filter,
+        plant=rescale_plant(filter.plant, units),
+        initial_mean=s * filter.initial_mean,
+        initial_covariance=np.outer(s, s) * filter.initial_covariance,
+    )
+    if isinstance(started, OpenLoop):
+        return started
+    return replace(
+        started,
+        sensor=rescale_sensor(started.sensor, units),
+        channel=_rescale_moments(started.channel, units),
+    )
+
+
+def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
+    """Return the filter, which has to be Gaussian."""
+    assert isinstance(filter, GaussianFilter)
+    return filter
+
+
+def _rescale_parts(filter: SequentialFilter, units: Units) -> list[AbstractFilter]:
+    """Return the filters of a sequential filter's parts in other units.
+
+    Factors of the parts' outputs, and of their measurements, follow one another in `units`.
+    """
+    parts, output, received = [], 0, 0  # where those of the next part begin
+    for part in filter.filters:
+        next_output, next_received = output + len(first(part.sensor).outputs), received + part.received
+        own = units._replace(outputs=units.outputs[output:next_output], received=units.received[received:next_received])
+        parts.append(rescale_filter(part, own))
+        output, received = next_output, next_received
+    return parts
+
+
+def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
+    """Return the law of the noise in other units, S w with S = diag(factors): mean S m, covariance S Q S."""
+    if isinstance(law, Gaussian):
+        return Gaussian(np.outer(factors, factors) * law.covariance, factors * law.mean)
+    return Shaped(np.diag(factors), law)
+
+
+def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
+    """Return the plant in other units: of states S x, with inputs U u."""
+    rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
+    return rescaled
+
+
+def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
+    """Return the plant whose states and inputs are counted in other units: S f(S^-1 x, U^-1 u) with noise S w.
+
+    f is the transition and w the noise, of covariance S W S; S and U are diagonal, of the factors of states and inputs.
+    """
+    s, u = units.states, units.inputs
+    center, law = _rescale_initial_law(plant, s)
+    noise: AbstractNoise | FunctionInUnits
+    if isinstance(plant.noise, AbstractNoise):
+        noise = _rescale_noise(plant.noise, s)
+    else:
+        noise = FunctionInUnits(plant.noise, np.outer(s, s), (u,))
+    factor = dict(zip(plant.states, s, strict=True))
+    limits = {name: (factor[name] * low, factor[name] * high) for name, (low, high) in plant.limits}
+    names = plant.states, plant.inputs, plant.circular
+    if isinstance(plant, LinearPlant):
+        matrix = _rescale_matrix(plant.matrix, s, s, u)
+        input_matrix = _rescale_matrix(plant.input_matrix, s, u, u)
+        return LinearPlant(matrix, noise, center, law, input_matrix, *names, limits=limits)
+    move = FunctionInUnits(plant.transition, s, (s, u))
+    return Plant(move, noise, center, law, *names, attitude=plant.attitude, limits=limits)
+
+
+def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarray, AbstractNoise | np.ndarray]:
+    """Return center and law (or covariance) of the initial state S x_0, S = diag(s).
+
+    A law is that of the deviation from a center, which is the mean less the deviation's own mean.
+    """
+    if plant.deviation is None:
+        return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
+    return s * (plant.initial_mean - plant.deviation.mean), _rescale_noise(plant.deviation, s)
+
+
+def _rescale_matrix(
+    matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
+) -> FunctionInUnits | np.ndarray:
+    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
+    factor = out[:, None] / into
+    if isinstance(matrix, MatrixOfInputs):
+        return FunctionInUnits(matrix.function, factor, (inputs,))
+    return np.asarray(out[:, None] * matrix / into)
+
+
+def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
+    """Return the sensor in other units: it measures R y of states S x."""
+    rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
+    return rescaled
+
+
+def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
+    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R."""
+    s, r = units.states, units.outputs
+    if isinstance(sensor, LinearSensor):
+        return LinearSensor(
+            r[:, None] * sensor.matrix / s, _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
+        )
+    return Sensor(
+        FunctionInUnits(sensor.measure, r, (s,)), _rescale_noise(sensor.noise, r), sensor.outputs, sensor.circular
+    )
+
+
+def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
+    """Return the second moments of a channel z = G y + n in other units, z = Q G R^-1 y + Q n, at each step."""
+    rescaled: SecondOrder | OverTime = at_each_step(lambda step: rescale_channel(step, units), channel)
+    return rescaled
+
+
+def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
+    """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
+
+    It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
+    """
+    q, (_, factor) = units.received, _list_channel_factors(units)
+
+    def scaled(quadratic: QuadraticMap) -> QuadraticMap:
+        """Return second moments of (G, n) in the other units."""
+        return QuadraticMap(factor * quadratic.center, factor * quadratic.radius)
+
+    gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+    spread, shift, power, nominal = map(scaled, (channel.spread, channel.shift, channel.power, channel.nominal))
+    mean = np.concatenate([gain, offset[:, None]], axis=1)
+    return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
+
+
+def _list_channel_factors(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
+    """Return the factors of M = (G, n), element ia, and of its second moments E[M_ia M_jb], element ijab."""
+    q, r = units.received, np.append(units.outputs, 1.0)
+    return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
+
+
+def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
+    """Return the description of a channel z = G y + n by mode in other units: z = Q G R^-1 y + Q n in each."""
+    values: Modes = stacked(channel)
+    of_mean, of_spread = _list_channel_factors(units)
+    noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
+    gains = of_spread * values.gain_spread
+    scaled: Modes = replace(values, mean=of_mean * values.mean, gain_spread=gains, noise=noise)
+    return OverTime(scaled) if isinstance(channel, OverTime) else scaled
+
+
+def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
+    """Return the combinations of a filter's atoms with state and measurements in other units."""
+    values = stack_over_time(components)
+    q = units.received
+    scaled = AtomCombinations(
+        values.weight,
+        q[:, None] * values.gain / units.states,
+        q * values.offset,
+        WeightedColumns(q[:, None] * values.noise.matrix, values.noise.weights),
+        values.mode,
+        values.transition,
+    )
+    return OverTime(scaled) if isinstance(components, OverTime) else scaled
+
+
+def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> UnconditionalMean | None:
+    """Return the mean before data with state and measurements in other units."""
+    if centre is None:
+        return None
+    s = units.states
+
+    def scaled(matrix: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+        """Return the product of each element with its factor, at each step."""
+        return OverTime(factors * matrix.values) if isinstance(matrix, OverTime) else factors * matrix
+
+    received = scaled(centre.received, units.received[:, None] / s)
+    return UnconditionalMean(
+        s * centre.start, scaled(centre.transition, s[:, None] / s), scaled(centre.drift, s), received
+    )
+
+
+def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
+    """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
+    y, z = _scale_monomials(units.states, degree), _scale_monomials(units.received, degree)
+    s = filter.steps.values
+    if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
+        y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))
+    steps = Steps(
+        transition=y[:, None] * s.transition / y,
+        drift=y * s.drift,
+        process=np.outer(y, y) * s.process,
+        output=z[:, None] * s.output / y,
+        offset=z * s.offset,
+        noise=np.outer(z, z) * s.noise,
+    )
+    projection = units.states[:, None] * filter.projection / y
+    system = LinearSystem(steps, y * filter.mean, np.outer(y, y) * filter.covariance, projection)
+    return LinearSystemFilter(system, filter.claim, filter.states)
+
+
+def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
+    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1."""
+    table = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
+    return np.asarray(np.prod(factors**table, axis=1))
