@@ -58,7 +58,7 @@ def count_stages(file: "DesignFile") -> int:
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
     """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
     import heliograph as hg
-    from heliograph.files.design_file import write_designed_source
+    from heliograph.files.design_file import make_designed_source
     from heliograph.planning.design_comparisons import list_totals_about
     from heliograph.report.pages.design import SOURCE, DesignResults
 

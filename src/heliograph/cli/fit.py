@@ -131,7 +131,9 @@ def fit_and_judge(
     changes: list[PredictionBeforeAndAfter] = []
     uniform: list[HeldOutTransforms] = []
     if learned_rows < rows:
-        changes = stop.unless_stopped(lambda: compare_before_and_after(start, fitted.network, z, u, learned_rows)) or []
+        changes = (
+            stop.run_unless_stopped(lambda: compare_before_and_after(start, fitted.network, z, u, learned_rows)) or []
+        )
     if changes:
         uniform = stop.run_unless_stopped(lambda: transform_held_out(fitted.network, changes, z, u, learned_rows)) or []
     # The law of lost messages, by node of which some were lost.

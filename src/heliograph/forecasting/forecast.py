@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.forecasting.forecast_result import Forecast
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
 from heliograph.forecasting.multistep_prediction import (
@@ -20,7 +20,7 @@ from heliograph.forecasting.multistep_prediction import (
     predict_moments_of_each,
 )
 from heliograph.forecasting.start_states import Sources, find_common_origin
-from heliograph.model.enlarged.joint_sensors import joint_sensor
+from heliograph.model.augmented.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first

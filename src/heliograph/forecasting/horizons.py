@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.forecasting.forecast_result import InputsAhead
-from heliograph.model.checks.inputs import check_inputs
+from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_count, fail, is_whole, rank, show_value

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.base import AbstractFilter, FilterAngles
-from heliograph.filters.filter_data import check_data
+from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.forecast_result import Forecast

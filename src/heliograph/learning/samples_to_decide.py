@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import scipy
 
-from heliograph.filters.gaussian.belief import open_loop_filter
+from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.learning.likelihood.predictive_density import (
     NODES,
     ChannelDensities,

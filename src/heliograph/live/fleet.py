@@ -16,8 +16,7 @@ from heliograph.live.plant_table import SlotTable, cut_chain_into_legs, group_by
 from heliograph.live.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
 from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, list_columns_of_blocks
 from heliograph.live.stuck_sensor_watch import RepeatWatch
-from heliograph.model.checks.refusals import count_by_reason
-from heliograph.model.limits import Limits
+from heliograph.model.checks.refusal_reasons import count_by_reason
 from heliograph.model.over_time import steps_covered
 from heliograph.model.reading_limits import ReadingLimits
 from heliograph.model.repeated_readings import Repeats

@@ -14,9 +14,9 @@ from heliograph.live.sender_status import LossChain, SenderStatus, SilenceRule
 from heliograph.live.stored.old_layout import can_read_layout, describe_old_layout, relocate_parts
 from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
 from heliograph.live.stuck_sensor_watch import RepeatWatch
-from heliograph.model.checks.faults import find_function_fault
-from heliograph.model.checks.inputs import check_inputs
-from heliograph.model.checks.refusals import SCREENED, Reason, count_by_reason
+from heliograph.model.checks.non_finite_results import describe_non_finite_function
+from heliograph.model.checks.plant_inputs import check_inputs
+from heliograph.model.checks.refusal_reasons import SCREENED, Reason, count_by_reason
 from heliograph.model.estimate import JudgedEstimate, lower_unsound_claim, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.reading_limits import LimitsLike, ScreenedReadings, make_limits

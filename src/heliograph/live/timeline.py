@@ -20,7 +20,7 @@ from heliograph.live.sorted_rows import BEFORE, HeldRow
 from heliograph.live.stored.migration import DESCRIPTION, SAME, PlantMigration, describe_network
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
-from heliograph.model.checks.refusals import SCREENED, Reason
+from heliograph.model.checks.refusal_reasons import SCREENED, Reason
 from heliograph.model.estimate import Estimate
 from heliograph.model.forecast_origin import Origin
 from heliograph.numerics.check import check_count, fail, instance, scalar, show_value

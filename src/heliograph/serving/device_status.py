@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from heliograph.files.availability import DeviceStatuses
+from heliograph.files.device_availability import DeviceStatuses
 from heliograph.serving.message import Payload
 from heliograph.serving.output import Output
 from heliograph.serving.service_loop import BatchService

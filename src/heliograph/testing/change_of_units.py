@@ -262,7 +262,7 @@ def _list_channel_factors(units: Units) -> tuple[Float[np.ndarray, "m p1"], Floa
 
 def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTime:
     """Return the description of a channel z = G y + n by mode in other units: z = Q G R^-1 y + Q n in each."""
-    values: Modes = stacked(channel)
+    values: Modes = stack_over_time(channel)
     of_mean, of_spread = _list_channel_factors(units)
     noise = WeightedColumns(units.received[:, None] * values.noise.matrix, values.noise.weights)
     gains = of_spread * values.gain_spread

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.filters.filter_for_likelihood import likelihood_filter
 from heliograph.learning.parametric_network import Build, Description
+from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at_each_step, first

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from heliograph.disk.quoting import quote_for_figure, visible
-from heliograph.numerics.counted_shares import round_to
+from heliograph.disk.quoted_text import quote_for_figure, visible
+from heliograph.numerics.confidence_intervals import round_to
 from heliograph.planning.design_comparisons import ChangeWorth, ErrorsOverPower, ErrorsOverSites
 from heliograph.planning.design_problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
@@ -102,7 +102,7 @@ def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
 
 
 @matplotlib.rc_context(STYLE)
-def draw_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, float]]) -> Figure:
+def draw_pareto_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, float]]) -> Figure:
     """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -142,7 +142,7 @@ def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figu
 
 
 @matplotlib.rc_context(STYLE)
-def draw_map(sites: ErrorsOverSites) -> Figure:
+def draw_error_map(sites: ErrorsOverSites) -> Figure:
     """Plot the error over places, darker where it is smaller, with the best place."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()

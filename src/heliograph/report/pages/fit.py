@@ -10,7 +10,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.disk.quoting import quote_for_figure, visible
+from heliograph.disk.quoted_text import quote_for_figure, visible
 from heliograph.learning.estimate_table import Row
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out_comparison import HeldOutTransforms, PredictionBeforeAndAfter
@@ -131,7 +131,7 @@ def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _draw_pits(received: list[HeldOutTransforms]) -> Figure:
+def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
     """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
     figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()

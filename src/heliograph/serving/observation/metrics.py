@@ -8,8 +8,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from heliograph.live.event import VERDICTS
-from heliograph.model.checks.refusals import OF_NODES
-from heliograph.report.outputs import summarise_output
+from heliograph.model.checks.refusal_reasons import OF_NODES
+from heliograph.report.sensor_output_health import summarise_output
 from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.service_watch import ServiceWatch
 

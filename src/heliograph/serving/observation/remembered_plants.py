@@ -47,7 +47,7 @@ class RememberedPlants:
         """Begin with no plant; `names`: those of the received numbers by node and filter."""
         self.count, self._names = 0, names  # names of the received numbers by node and filter
         self.points: OrderedDict[str, deque[ChartPoint]] = OrderedDict()
-        self.outputs: OrderedDict[str, RecentOutputs] = OrderedDict()
+        self.outputs: OrderedDict[str, RecentInnovations] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self.crossings: OrderedDict[str, dict[tuple[str, ...], Mapping[str, float]]] = OrderedDict()
         self.senders: OrderedDict[str, dict[str, dict[str, Any]]] = OrderedDict()
