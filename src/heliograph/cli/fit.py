@@ -2,6 +2,7 @@
 
 import re
 import sys
+from fractions import Fraction
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -119,7 +120,7 @@ def learn(
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
-    learned_rows = rows - int(held_out * rows)
+    learned_rows = rows - int(Fraction(str(held_out)) * rows)  # of 0.29 as it is written, not of the nearest double
     fitted = _fit_with_progress(build, recording, learned_rows, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
     # How well the later rows were predicted before and after the fit; whether what was predicted then holds.
