@@ -14,6 +14,7 @@ from heliograph.forecasting.origins import Sources, find_common_origin
 from heliograph.forecasting.outlook import (
     Outlook,
     find_output_claim,
+    find_received_claim,
     look_ahead,
     look_ahead_of_each,
     make_outlook,
@@ -210,15 +211,14 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    claim = filter.claim
     measured = outputs and prediction_of(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, target.received, claim, angles.received)
+    arriving = received and prediction_of(received, target.received, find_received_claim(filter), angles.received)
     return Forecast(
         steps=ahead.steps,
         time=ahead.time,
-        states=prediction_of(states, filter.states, claim, angles.states),
+        states=prediction_of(states, filter.states, filter.claim, angles.states),
         outputs=measured,
         received=arriving,
         inputs=ahead.inputs,

@@ -12,7 +12,7 @@ from heliograph.filters.filter_data import check_data
 from heliograph.forecasting.backtest import list_filtered_places, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
 from heliograph.forecasting.origins import origin_of
-from heliograph.forecasting.outlook import Outlook, find_output_claim, make_outlook, prediction_of
+from heliograph.forecasting.outlook import Outlook, find_output_claim, find_received_claim, make_outlook, prediction_of
 from heliograph.forecasting.prediction import Forecast
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
@@ -92,7 +92,7 @@ def _make_forecast(outlook: Outlook, z: np.ndarray, u: np.ndarray, names: tuple[
     measured = outputs and prediction_of(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, names, filter.claim, angles.received)
+    arriving = received and prediction_of(received, names, find_received_claim(filter), angles.received)
     return Forecast(
         steps=np.ones(len(z), int),
         time=np.arange(float(len(z))),

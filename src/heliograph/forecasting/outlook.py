@@ -14,12 +14,15 @@ from heliograph.engine.choice import choose_code, compile_on_call, compute_once
 from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.adaptive import AdaptiveFilter
 from heliograph.filters.gaussian.belief import second_moments_at_start
+from heliograph.filters.gaussian.robust import RobustFilter
 from heliograph.filters.gaussian.signal import signal_of
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.forecasting.prediction import Prediction
 from heliograph.model.estimate import Claim, weakest
@@ -31,6 +34,7 @@ from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memory import memories
+from heliograph.random_affine.outliers import StudentT
 
 BLOCK = 128  # plants side by side under XLA
 
@@ -110,12 +114,19 @@ class Outlook(Module):
             mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
+        # The sensor's noise, as it was learned where the filter learns it.
+        noise = self.filter.sensor_noise(prior, k) if isinstance(self.filter, AdaptiveFilter) else None
+
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""
-            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start)
+            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start, noise)
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
+        # Student's law of at most two degrees has no variance.
+        if isinstance(sensor.noise, StudentT):
+            endless = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
+            covariances = jax.vmap(lambda covariance: mark_unknown(covariance, endless))(covariances)
         return Moments(weights=states.weights, means=means, covariances=covariances)
 
     def predict_received(self, prior: PyTree, k: jax.Array) -> Moments | None:
@@ -125,8 +136,14 @@ class Outlook(Module):
         """
         if not self.receives:
             return None
-        _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
-        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
+        if isinstance(self.filter, ToldFilter):  # zeros would tell a law
+            innovation = self.filter.expect(prior, k)
+        else:
+            _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
+        covariance = jnp.asarray(innovation.covariance)
+        if isinstance(self.filter, RobustFilter):  # whose law of noise may have no variance
+            covariance = mark_unknown(covariance, jnp.asarray(at(self.filter.noise, k).degrees) <= 2)
+        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], covariance[None])
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
@@ -249,3 +266,10 @@ def find_output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])
+
+
+def find_received_claim(filter: AbstractFilter) -> Claim:
+    """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical."""
+    if isinstance(filter, ToldFilter) and not filter.knows_law_of_numbers and filter.claim != "none":
+        return weakest([filter.claim, "nominal"])
+    return filter.claim

@@ -100,12 +100,14 @@ def signal_of(
 def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     """Return (|H| root E[x_i^2] + |E v|)^2 + Var v at the start, (p,): size of the terms that are summed in y.
 
+    The noise counts without its outliers: Student's law of at most two degrees has no variance.
+
     `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
     moments before data grow without end where only inputs hold a plant.
     """
     law = sensor.noise
     reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
-    size: jax.Array = reach**2 + diagonal(law.covariance)
+    size: jax.Array = reach**2 + diagonal(law.without_outliers().covariance)
     return size
 
 
