@@ -69,6 +69,8 @@ def test_outputs_have_the_noise_that_was_learned():
     ahead = hg.forecast(filter.run(z), 2)
     np.testing.assert_allclose(ahead.outputs.covariance, ahead.received.covariance, rtol=1e-12)
     assert ahead.outputs.deviation[0, 0] > 4
+    drawn = hg.forecasting.draw_paths(filter.run(z), 2, draws=4000).y[:, :, 0]
+    np.testing.assert_allclose(drawn.std(axis=0), ahead.outputs.deviation[:, 0], rtol=5 / np.sqrt(8000))
     # Of the other output nothing is learned where only the first arrives.
     both = hg.LinearSensor([[1.0], [2.0]], np.diag([0.3, 0.7]))
     link = hg.random_affine.known([[1.0, 0.0]])

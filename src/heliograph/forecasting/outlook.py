@@ -115,7 +115,9 @@ class Outlook(Module):
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
         # The sensor's noise, as it was learned where the filter learns it.
-        noise = self.filter.sensor_noise(prior, k) if isinstance(self.filter, AdaptiveFilter) else None
+        noise = None
+        if isinstance(self.filter, AdaptiveFilter):
+            noise = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""

@@ -132,17 +132,17 @@ class AdaptiveFilter(AbstractWrapper):
         variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
         return variances
 
-    def sensor_noise(self, state: AdaptiveBelief, k: Step = 0) -> WeightedColumns:
-        """Return factors of the sensor's noise with what was learned: scaled as the noise of what brings each output.
+    def noise_deviations(self, state: AdaptiveBelief, k: Step = 0) -> Float[jax.Array, " outputs"]:
+        """Return deviations of the sensor's noise as they were learned, in units of its own, of each output.
 
-        Of an output that several received numbers bring it is scaled by their mean, of one that none brings not at all.
+        They are those of the noise that brings it, of several received numbers their root mean square; of an output
+        that none brings 1.
         """
         noise = at(self.noise, k)
         ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
         brings = jnp.asarray(noise.output)  # (m, p): 1 where number i brings output a
         count = jnp.sum(brings, axis=0)
-        ratio_of_output = jnp.where(count > 0, brings.T @ ratio / jnp.maximum(count, 1), 1.0)
-        return at(self.base.sensor, k).noise.columns.through(jnp.diag(jnp.sqrt(ratio_of_output)))
+        return jnp.sqrt(jnp.where(count > 0, brings.T @ ratio / jnp.maximum(count, 1), 1.0))
 
 
 class VariationalUpdate(NamedTuple):
