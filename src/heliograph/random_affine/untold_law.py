@@ -4,12 +4,20 @@ from collections import Counter
 from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.hop import GainAndNoise
 from heliograph.random_affine.laws.law import AbstractLaw, Discrete
 from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.reported_law import AbstractTold, FreshNumbers, PilotedHop, ToldGainHop, ToldMap
+from heliograph.random_affine.reported_law import (
+    AbstractTold,
+    FreshNumbers,
+    PilotedHop,
+    ToldGainHop,
+    ToldMap,
+    told_maps,
+)
 
 T = TypeVar("T")
 
@@ -36,6 +44,18 @@ def has_untold_law(channel: AbstractRandomAffine) -> bool:
     maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told) if isinstance(leaf, AbstractTold)]
     shared = Counter(affine.memory.identity for affine in maps)
     return all(_find_untold(affine) is not None for affine in maps) and max(shared.values(), default=0) <= 1
+
+
+def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
+    """Draw what a message tells of all maps of a channel, in the order of `told_maps`.
+
+    Raises:
+        ValueError: numbers whose law nobody knows.
+    """
+    memories = [affine.memory for affine in told_maps(channel)]
+    keys = jax.random.split(key, len(memories))
+    drawn = [memory.announce(memory.begin(key)) for memory, key in zip(memories, keys, strict=True)]
+    return jnp.concatenate([jnp.ravel(jnp.asarray(told, dtype=float)) for told in drawn])
 
 
 def _find_untold(affine: AbstractTold) -> AbstractRandomAffine | None:

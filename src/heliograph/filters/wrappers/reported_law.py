@@ -43,7 +43,7 @@ from heliograph.random_affine.reported_law import (
     numbers_of_outputs,
     told_maps,
 )
-from heliograph.random_affine.untold_law import believe_untold, has_untold_law
+from heliograph.random_affine.untold_law import believe_untold, draw_told, has_untold_law
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
@@ -103,6 +103,14 @@ class ToldFilter(AbstractWrapper):
         """
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
         return self._place_innovation(filter.correct(state, jnp.zeros(len(self.values)), k)[1])
+
+    def draw_numbers(self, key: jax.Array, k: Step = 0) -> jax.Array:
+        """Draw the numbers that a message tells at step k by their laws; raise ValueError where one has none."""
+        return draw_told(at(self.link, k), key)
+
+    def with_numbers(self, z: jax.Array, numbers: jax.Array) -> jax.Array:
+        """Return a message with these numbers in the place of its own."""
+        return z.at[np.array(self.numbers)].set(numbers)
 
     @property
     def knows_law_of_numbers(self) -> bool:
