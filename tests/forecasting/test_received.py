@@ -38,6 +38,15 @@ def test_a_gain_that_will_be_told_has_its_law_ahead(build):
     assert np.isnan(ahead.received.mean[:, 1]).all() and ahead.received.claim == "exact"
 
 
+def test_limits_of_a_state_do_not_hide_that_its_gain_will_be_told():
+    """Far within its limits a state has the forecast of one without them."""
+    link, rows = hg.hop(RAYLEIGH, 0.1, known=True), [[4.0, 0.9], [5.0, 1.1]]
+    limited = hg.LinearPlant([[0.95]], 0.2, [5.0], 1.0, limits={"x0": (-100.0, None)})
+    found, plain = (hg.forecast(hg.extended_filter(p, SENSOR, link).run(rows), 2).received for p in (limited, PLANT))
+    np.testing.assert_allclose(found.mean[:, 0], plain.mean[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(found.covariance[:, 0, 0], plain.covariance[:, 0, 0], rtol=1e-12)
+
+
 def test_a_variance_that_will_be_declared_has_its_law_or_is_typical():
     variances = {}
     for law in (hg.Discrete([1.0, 3.0], [0.25, 0.75]), None):

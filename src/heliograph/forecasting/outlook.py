@@ -3,6 +3,7 @@
 A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K parts.
 """
 
+from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
+from heliograph.factors.columns import WeightedColumns
 from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
@@ -25,7 +27,7 @@ from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.forecasting.prediction import Prediction
-from heliograph.model.estimate import Claim, weakest
+from heliograph.model.estimate import Claim, Innovation, weakest
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
@@ -115,13 +117,13 @@ class Outlook(Module):
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
         # The sensor's noise, as it was learned where the filter learns it.
-        noise = None
+        learned: WeightedColumns | None = None
         if isinstance(self.filter, AdaptiveFilter):
-            noise = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
+            learned = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""
-            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start, noise)
+            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start, learned)
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
@@ -132,20 +134,11 @@ class Outlook(Module):
         return Moments(weights=states.weights, means=means, covariances=covariances)
 
     def predict_received(self, prior: PyTree, k: jax.Array) -> Moments | None:
-        """Return the moments of what would arrive at step k, by the predicted state; None where the filter cannot tell.
-
-        Of z = 0 the innovation is minus what is expected, with the covariance of what arrives.
-        """
+        """Return the moments of what would arrive at step k, by the predicted state; None if the filter cannot tell."""
         if not self.receives:
             return None
-        if isinstance(self.filter, ToldFilter):  # zeros would tell a law
-            innovation = self.filter.expect(prior, k)
-        else:
-            _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
-        covariance = jnp.asarray(innovation.covariance)
-        if isinstance(self.filter, RobustFilter):  # whose law of noise may have no variance
-            covariance = mark_unknown(covariance, jnp.asarray(at(self.filter.noise, k).degrees) <= 2)
-        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], covariance[None])
+        innovation = _expect(self.filter, prior, k)
+        return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
         """Predict over step k; return the state there, and the moments of states, outputs and received numbers."""
@@ -155,6 +148,19 @@ class Outlook(Module):
         # From an unknown start the sensor is received as it is, and there is no innovation of what nobody knows.
         received = outputs if isinstance(prior, Diffuse) else self.predict_received(prior, k)
         return prior, (states, outputs, received)
+
+
+def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
+    """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
+    if isinstance(filter, LimitedFilter):
+        return _expect(filter.base, filter.hold(prior), k)
+    if isinstance(filter, ToldFilter):  # zeros would tell a law
+        return filter.expect(prior, k)
+    _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
+    if isinstance(filter, RobustFilter):  # whose law of noise may have no variance
+        has_none = jnp.asarray(at(filter.noise, k).degrees) <= 2
+        return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_none))
+    return innovation
 
 
 def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
@@ -272,6 +278,7 @@ def find_output_claim(filter: AbstractFilter, outlook: Outlook) -> Claim:
 
 def find_received_claim(filter: AbstractFilter) -> Claim:
     """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical."""
-    if isinstance(filter, ToldFilter) and not filter.knows_law_of_numbers and filter.claim != "none":
+    base = filter.base if isinstance(filter, LimitedFilter) else filter
+    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
         return weakest([filter.claim, "nominal"])
     return filter.claim

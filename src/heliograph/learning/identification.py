@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.learning.free_network import Build, describe
 from heliograph.learning.intervals import quantile
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, join_world, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.parameters import Parameters
+from heliograph.learning.told_numbers import TellsNumbers
 from heliograph.learning.unidentified import (
     WEAK,
     Confounded,
@@ -244,15 +244,17 @@ def _draw_expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> 
         k, u_k, noise = row
         prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
         # What a message tells of its link is drawn first: it gives the law of the rest.
-        is_told = isinstance(filter, ToldFilter)
-        numbers = filter.draw_numbers(jax.random.fold_in(key_of_numbers, k), k) if is_told else None
-        told = filter.with_numbers(zeros, numbers) if is_told else zeros
+        numbers = jnp.zeros(0)
+        if isinstance(filter, TellsNumbers):
+            numbers = filter.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
+            zeros = filter.with_numbers(zeros, numbers)
         # The innovation of z = 0 is -E z, with covariance S; of what is told both are NaN.
-        received = filter.correct(prior, told, k)[1]
+        received = filter.correct(prior, zeros, k)[1]
         is_value = ~jnp.isnan(received.value)
         S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
         z = cholesky(S) @ noise - received.value
-        z = filter.with_numbers(z, numbers) if is_told else z
+        if isinstance(filter, TellsNumbers):
+            z = filter.with_numbers(z, numbers)
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())

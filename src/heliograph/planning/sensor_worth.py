@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.likelihood_filter import likelihood_filter
-from heliograph.filters.wrappers.reported_law import ToldFilter
+from heliograph.learning.told_numbers import TellsNumbers
 from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.sensor import is_linear
@@ -246,7 +246,7 @@ def _compute_squares_at_end(
     squares, used = [], filter.angles_used()
     # What arrives decides the variances, and what a message tells of its link: where both are the same in all runs,
     # so are they.
-    is_number = np.isin(np.arange(z.shape[-1]), filter.numbers if isinstance(filter, ToldFilter) else ())
+    is_number = np.isin(np.arange(z.shape[-1]), filter.numbers if isinstance(filter, TellsNumbers) else ())
     deciding = np.where(is_number, z, np.isnan(z))
     alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
     for row, x in zip(z, truth, strict=True):
