@@ -61,6 +61,16 @@ def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tm
 
 
 @pytest.mark.slow
+def test_a_share_of_rows_is_of_the_decimal_that_is_typed(folder, tmp_path):
+    """29 of 100: the nearest double of 0.29 times 100 is 28.999999999999996."""
+    lines = (folder / "data.csv").read_text().splitlines()
+    (tmp_path / "data.csv").write_text("\n".join(lines[:101]))
+    command = ["fit", str(folder / "cart.py"), "--measurements", str(tmp_path / "data.csv"), "--held-out", "0.29"]
+    assert cli.main([*command, "--out", str(tmp_path / "out"), "--starts", "1"]) == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["held_out_rows"] == 29
+
+
+@pytest.mark.slow
 def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
     """By the difference of the log-likelihoods of both filters over the last 150 rows, computed another way."""
     summary = json.loads((folder / "out" / "summary.json").read_text())

@@ -35,6 +35,11 @@ def test_run_writes_what_the_library_computes(folder, capsys):
             assert row["valid"] == 1
 
 
+def test_a_lag_is_refused_of_rows_before_they_are_read(folder, capsys):
+    (folder / "data.csv").write_text("time,push,pos\n0,0,no number\n")
+    refused(folder, capsys, [*run_arguments(), "--lag", "1"], "--lag", "expected messages or events, got rows of time")
+
+
 @pytest.mark.slow
 def test_run_writes_what_later_rows_say_too(folder, capsys):
     assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0

@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -260,6 +262,27 @@ def test_stamps_that_lost_their_digits_are_said(tmp_path):
     (tmp_path / "six.csv").write_text("time,y\n1.73234e+09,1\n1.73234e+09,2\n1.73234e+09,3\n1.73235e+09,4\n")
     with pytest.warns(UserWarning, match="column 'time': 3 of 4 rows share their time with another row"):
         h.files.read_recording(tmp_path / "six.csv", WALK)
+
+
+@pytest.mark.parametrize(
+    ("times", "date"),
+    [
+        (("20200130", "20200131", "20200201"), "2020-01-30"),
+        (("202001302359", "202001310000"), "2020-01-30T23:59"),
+        (("20200130235959", "20200131000000"), "2020-01-30T23:59:59"),
+        (("20200130", "20200132"), None),  # a count
+        (("20200130",), None),
+    ],
+)
+def test_dates_written_as_numbers_are_said(tmp_path, times, date):
+    """From 30 to 31 January is 1, and from there to 1 February 70."""
+    (tmp_path / "compact.csv").write_text("time,y\n" + "".join(f"{time},1\n" for time in times))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        h.files.read_recording(tmp_path / "compact.csv", WALK)
+    texts = [str(warning.message) for warning in said]
+    found = [text for text in texts if "read as dates without separators" in text]
+    assert len(found) == (date is not None) and all(text.endswith(f"a date is written as {date}") for text in found)
 
 
 def test_doubled_columns_are_refused_at_every_door(tmp_path):

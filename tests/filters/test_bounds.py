@@ -123,6 +123,19 @@ def check_optimal_scalars(build):
     assert best <= min(np.trace(one_step(build(hg.filters.Scalars(a, b)))[3]) for a in grid for b in grid) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("build", [hg.filters.Interval, hg.filters.Polytope])
+@pytest.mark.parametrize("given", [(1e-3, np.nan), (np.nan, 0.3), (np.nan, 1e-2)])
+def test_beside_a_given_scalar_the_other_is_the_best(build, given):
+    """Of a grid of the free one, with the given one as it is, no bound has a smaller trace."""
+
+    def trace_with(pair):
+        scalars = eqx.tree_at(lambda s: s.values, hg.filters.Scalars(1.0, 1.0), np.array(pair))
+        return np.trace(one_step(build(scalars))[3])
+
+    grid = 10.0 ** np.arange(-3.5, 1.1, 0.1)
+    assert trace_with(given) <= min(trace_with(np.where(np.isnan(given), a, given)) for a in grid) * (1 + 1e-12)
+
+
 def random_setting(rng):
     s = {**STRONG}
     for name in ("xi", "gamma"):

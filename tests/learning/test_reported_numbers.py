@@ -45,3 +45,17 @@ def test_noise_as_a_function_of_what_is_declared():
     # taken for silence, whose likelihood of 0 would win.
     at_the_truth = hg.log_likelihood(hg.linear_filter(PLANT, SENSOR, noisy(*TRUE)), z)
     assert at_the_truth < found.best.total < at_the_truth + 5  # two numbers: 1 nat in the mean
+
+
+@pytest.mark.slow
+def test_before_data_it_is_known_that_messages_which_tell_their_gain_identify_the_noises():
+    """What is told is drawn by its law: no number of the link is NaN for want of a message."""
+
+    def behind_a_gain():
+        plant = hg.LinearPlant([[0.9]], hg.free(0.2, "plant noise"), [0.0], 1.0)
+        link = hg.hop(hg.Rayleigh(0.8), hg.free(0.1, "link noise"), known=True)
+        return hg.Network(plant, {"a": hg.Node(SENSOR, link, {"f": hg.linear_filter(plant, SENSOR, link)})})
+
+    assert hg.learning.identifiable(behind_a_gain, horizon=100).identified == ("plant noise", "link noise")
+    with pytest.raises(ValueError, match=r"expected a law of the numbers: told\(..., law=...\), got none"):
+        hg.learning.identifiable(build, horizon=100)

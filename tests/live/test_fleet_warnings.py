@@ -80,3 +80,27 @@ def test_a_service_logs_and_counts_it_by_plant(network):
     watch.wrap(service)
     assert 'heliograph_gave_in_total{filter="gate",node="a"} 2.0' in metrics_of(watch)
     assert [re.match(f"warning: plant '(.*)', {SAID}", line)[1] for line in said] == ["first", "second"]
+
+
+def test_where_warnings_are_errors_what_was_taken_counts(network):
+    line, stream = hg.Timeline(network, 9), hg.Stream(network.nodes["a"].filters["gate"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for k in range(2):
+            line.push("a", k, k, [100.0])
+            stream.push([100.0])
+        with pytest.raises(UserWarning, match=SAID):
+            line.push("a", 2, 2, [100.0])
+        with pytest.raises(UserWarning, match=r"^stream, the gate gave in once"):
+            stream.push([100.0])
+        assert line.counts["a"]["used"] == 3 and stream.steps == 3
+        assert line.push("a", 2, 2, [100.0]) == "duplicate"
+        np.testing.assert_array_equal(stream.push([100.0]).mean, _after_four(network))
+
+
+def _after_four(network):
+    """Mean after four readings, of a stream whose warnings are no errors."""
+    stream = hg.Stream(network.nodes["a"].filters["gate"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return [stream.push([100.0]).mean for _ in range(4)][-1]

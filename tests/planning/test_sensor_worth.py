@@ -103,3 +103,14 @@ def test_what_cannot_be_asked_is_said_in_one_line(network):
     asking = hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.1), hg.perfect(1), {}, trigger=hg.SendOnDelta(0.5))
     with pytest.raises(ValueError, match="node 'a': expected a sensor that sends what it measures at each step"):
         worth_of_sensors(hg.Network(network.plant, {"a": asking}))
+
+
+def test_gains_that_are_told_make_an_exact_error_random():
+    """A gain of 0 or 2 that each message tells: the variance after it is P or 1 / (1 / P + 4 / r), by half each."""
+    plant, link = hg.LinearPlant([[1.0]], 0.5, [0.0], 0.5), hg.hop(hg.Discrete([0.0, 2.0], [0.5, 0.5]), 0.4, known=True)
+    found = worth_of_sensors(
+        hg.Network(plant, {"a": hg.Node(hg.LinearSensor([[1.0]], 0.0), link, {})}), steps=1, runs=400, without=[]
+    )
+    variance = (1.0 + 1 / (1 + 4 / 0.4)) / 2
+    assert found.exact and 0 < found.complete.uncertainty[0] < 0.03
+    assert found.complete.error[0] ** 2 == pytest.approx(variance, abs=5 * 0.5 * (1 - 1 / 11) / np.sqrt(400))

@@ -69,6 +69,18 @@ def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
         check_random_affine(Modes(kind(BURSTS), [GOOD, BAD]))
 
 
+class _Splits(hg.random_affine.MarkovChain):
+    """A chain that moves to either mode with probability 1/2: by the sign of noise, drawn with half of a key."""
+
+    def move(self, state, key):
+        return (GOOD.sample(jax.random.split(key)[0])[0, -1] > 0).astype(int)
+
+
+def test_the_check_draws_twice_by_keys_that_have_no_part_in_common():
+    """The second draw's map is drawn with half of its key: of another key than that by which the mode moved."""
+    check_random_affine(Modes(_Splits(np.full((2, 2), 0.5)), [GOOD, BAD]))
+
+
 def test_one_object_or_one_name_is_one_memory():
     chain = hg.random_affine.MarkovChain(BURSTS)
     local, same = Series([link(), link()]), Series([Modes(chain, [GOOD, BAD]), Modes(chain, [BAD, GOOD])])

@@ -263,3 +263,8 @@ def test_a_link_that_delivers_late_is_refused_and_doubted():
         "boundedness: not judged (channel: expected one without delays, got one that is late" in str(doubt)
         for doubt in doubts
     )
+
+
+def test_a_network_in_which_nothing_is_measured_is_refused():
+    with pytest.raises(ValueError, match="nodes: expected at least one that receives a sensor, got none"):
+        hg.simulation.certify_boundedness(hg.Network(plant([[0.9]]), {"a": None}))

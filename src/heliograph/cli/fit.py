@@ -2,6 +2,7 @@
 
 import re
 import sys
+from fractions import Fraction
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -121,7 +122,7 @@ def fit_and_judge(
     recording = data.recording
     # Earlier rows to learn from, later ones to judge.
     rows = len(recording.time)
-    learned_rows = rows - int(held_out * rows)
+    learned_rows = rows - int(Fraction(str(held_out)) * rows)  # of 0.29 as it is written, not of the nearest double
     fitted = _fit_with_progress(build, recording, learned_rows, starts, seed, truth, advance, stop)
     fitted = replace(fitted, delays={} if data.events is None else data.events.delays())
     # How well each filter predicted the later rows before and after the fit (log-likelihood), and whether the fitted

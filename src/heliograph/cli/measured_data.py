@@ -82,6 +82,7 @@ def read_measured_plants(
     module: Mapping[str, object],
     options: ReadingOptions,
     advance: "Advance",
+    lag: float | None = None,
 ) -> list[MeasuredPlant]:
     """Return the measured data of each plant, from a table, messages or a store.
 
@@ -92,16 +93,18 @@ def read_measured_plants(
         module: its file's names, such as `sources`, by which messages are read.
         options: as typed.
         advance: called with the progress.
+        lag: how much later estimates are asked for, of messages; None for none.
 
     Raises:
-        ValueError: what cannot be read; an option of messages where there are rows of time; a plant that is not there.
+        ValueError: what cannot be read; an option of messages where there are rows of time, which are not read then; a
+            plant that is not there.
     """
     from heliograph.numerics.check import fail
 
     path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
-        if options.are_for_messages:
+        if options.of_messages or lag is not None:
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]

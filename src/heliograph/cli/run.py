@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
-from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
-from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
-from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
-from heliograph.files.stores.store_address import StoreAddress
+from heliograph.cli.app import estimates_option, measured_option, path_option
+from heliograph.cli.filtered_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
+from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
+from heliograph.cli.reading import ReadingOptions, read_measured
+from heliograph.files.stores.address import StoreAddress
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
@@ -83,7 +83,7 @@ def run(
         said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
-        measured = [] if said_of_blocks else _read_plants(measurements, network, loaded, module, lag, options, advance)
+        measured = [] if said_of_blocks else read_measured(measurements, network, loaded, module, options, advance, lag)
         # Each plant by itself, with the place where its estimates were written.
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:
@@ -100,24 +100,6 @@ def run(
     lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
-
-
-def _read_plants(
-    measurements: Path | StoreAddress,
-    reference: str,
-    network: "Network",
-    module: "Mapping[str, object]",
-    lag: float | None,
-    options: ReadingOptions,
-    advance: "Advance",
-) -> list[MeasuredPlant]:
-    """Return what was measured of each plant; raise ValueError if a lag is asked for of rows of time."""
-    from heliograph.numerics.check import fail
-
-    measured = read_measured_plants(measurements, reference, network, module, options, advance)
-    if lag is not None and measured[0].events is None:
-        raise fail("--lag", "messages or events", f"rows of time in {measurements}")
-    return measured
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":

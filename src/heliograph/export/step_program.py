@@ -90,10 +90,10 @@ def lower_step_to_c_functions(
         symmetric = _find_symmetric_arrays(parts)
         # Mean and covariance of the estimate become members of their own only where no array of the state has the same
         # numbers after every part. So all are written once to see which results are the same; `holders` are the
-        # numbers of the two candidates that hold mean and covariance, the highest where parts differ.
-        with_all = [_lower_part_to_c(part, symmetric, prefix, real, size) for part in parts]
+        # numbers of the two candidates that hold mean and covariance.
+        with_all = [_write_part(part, symmetric, prefix, real, size) for part in parts]
         numbers = range(len(read), len(candidates))
-        holders = [max(_find_same_result(n, code, candidates) for code in with_all) for n in numbers]
+        holders = [_find_same_result(n, with_all, candidates) for n in numbers]
         kept = [*range(len(read)), *(n for n in holders if n >= len(read))]
         members = [candidates[n] for n in kept]
         computes = [_lower_part_to_c(part, symmetric, prefix, real, size, kept, (read, members)) for part in parts]
@@ -132,9 +132,9 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
     return of_state, of_estimate
 
 
-def _find_same_result(number: int, code: Any, named: Sequence[StateMember]) -> int:
-    """Return the first result that is always equal to this one, before the first step too; itself where none is."""
-    same = [n for n in range(number) if code.results[n].same == code.results[number].same]
+def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
+    """Return the first result that is equal to this one after every part and before the first; itself where none is."""
+    same = [n for n in range(number) if all(code.results[n].same == code.results[number].same for code in parts)]
     start = named[number].start
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
 

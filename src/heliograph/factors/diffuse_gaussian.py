@@ -62,12 +62,18 @@ def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
 
 def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the covariance of H x (m, m) by what is known, and which components hear an unknown direction (m,)."""
-    slopes, reach = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
-    unknown = jnp.any((jnp.abs(slopes) > DEAF * reach) & (x.infinite > 0), axis=1)
+    slopes = _find_slopes(matrix, x)
+    unknown = jnp.any((slopes != 0) & (x.infinite > 0), axis=1)
     return (slopes * x.variances) @ slopes.T, unknown
 
 
-class FiniteAndInfiniteWeights(NamedTuple):
+def _find_slopes(matrix: jax.Array, x: Diffuse) -> jax.Array:
+    """Return the slopes H L of H x, (m, n): 0 along an unknown direction of which rounding alone is left."""
+    slopes, reach = matrix @ x.root, jnp.abs(matrix) @ jnp.abs(x.root)
+    return jnp.where((x.infinite > 0) & (jnp.abs(slopes) <= DEAF * reach), 0.0, slopes)
+
+
+class LevelWeights(NamedTuple):
     """Weights of columns (c,): finite ones, and infinite ones."""
 
     finite: jax.Array
@@ -124,8 +130,8 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w."""
-    rows, weights = _append_noise_columns(matrix @ x.root, x, noise)
-    lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
+    rows, weights = _append_noise(_find_slopes(matrix, x), x, noise)
+    lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
 
 
@@ -210,7 +216,11 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
         # The sum that counts: the infinite part once z shows an unknown direction, before it the finite one.
         leading_s = jnp.where(s_inf > 0, s_inf, s)
         # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
-        columns[j] = jnp.where(is_unknown & ~is_shown, column, column - f * reciprocal_or_zero(leading_s) * cross)
+        taken = jnp.where(is_unknown & ~is_shown, 0.0, f * reciprocal_or_zero(leading_s) * cross)
+        # What is left of an unknown direction in a component that z told is 0, not rounding of infinite weight.
+        rounding = DEAF * (jnp.abs(column) + jnp.abs(taken))
+        is_left = ~is_unknown | is_first_unknown | (jnp.abs(column - taken) > rounding)
+        columns[j] = jnp.where(is_left, column - taken, 0.0)
         next_s = s + jnp.where(is_unknown, 0.0, f**2 * d[j])
         next_s_inf = s_inf + jnp.where(shows_unknown, f**2 * d_inf[j], 0.0)
         # Beside an unknown direction that z shows, finite variances are nothing.
@@ -241,7 +251,7 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     n = len(x.mean)
-    moved, weights = _append_noise_columns(matrix @ x.root, x, noise)
+    moved, weights = _append_noise(_find_slopes(matrix, x), x, noise)
     own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
     lower, _, rest = triangularise_both_levels(jnp.concatenate([moved, own]), weights, n)
     left, levels, _ = triangularise_both_levels(rest[n:], weights, n, own**2 @ weights.infinite)

@@ -22,7 +22,7 @@ from heliograph.model.checks.plant_inputs import find_time_step_fault
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, fail, flag, instance
 from heliograph.numerics.module import readable
-from heliograph.numerics.times.dates import seconds_between
+from heliograph.numerics.times.dates import read_compact_date, seconds_between
 from heliograph.numerics.times.row_times import backwards_text, find_backwards_row
 from heliograph.numerics.types import append_unit
 from heliograph.simulation.network import Network
@@ -247,6 +247,7 @@ def _make_inputs(
         where = f"{source}, row {rows.numbers[row]}, column {TIME!r}"
         raise fail(where, "a time that does not go backwards", backwards_text(time, row))
     _warn_of_equal_times(time, source)
+    _warn_of_dates_as_numbers(time, source)
     u = np.zeros((len(time), len(network.inputs)))
     for i, name in enumerate(network.inputs):
         u[:, i] = given[name][rows.read_row] if name in given else seconds_between(time)
@@ -263,5 +264,15 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
         warnings.warn(
             f"{source}, column {TIME!r}: {shared} of {len(time)} rows share their time with another row, as stamps do "
             f"that lost their digits; {len(counts)} times in all",
+            stacklevel=7,
+        )
+
+
+def _warn_of_dates_as_numbers(time: np.ndarray, source: str) -> None:
+    """Warn where all times read as dates without separators: as numbers a day after the 31st is 70 later."""
+    if len(time) > 1 and (date := read_compact_date(time)):
+        warnings.warn(
+            f"{source}, column {TIME!r}: {time[0]:.14g} and all others read as dates without separators; they are "
+            f"taken as numbers, which do not count time evenly: a date is written as {date}",
             stacklevel=7,
         )

@@ -193,16 +193,19 @@ def _smooth_noises(
     the noise's covariance less that of the noise given the data. Shapes: means (steps, size), covariances
     (steps, size, size).
 
+    Given all data a noise v has the mean E[v | data], which varies with the data: its covariance is what is returned,
+    not that of the noise given the data, Cov[v | data] = R - Cov E[v | data].
+
     Backward over the rows with r and N = Cov r, which hold what all later rows tell. At each row, with
     S = C P C' + R and K = P C' S^-1:
 
-    - the outputs' noise has the mean R (S^-1 e - K' r) and the covariance R (S^-1 + K' N K) R;
+    - the outputs' noise has the mean R (S^-1 e - K' r), whose covariance is R (S^-1 + K' N K) R;
     - r <- C' S^-1 e + (I - K C)' r takes this row in;
-    - the plant's noise on the way to the row has the mean Q r and the covariance Q N Q;
+    - the plant's noise on the way to the row has the mean Q r, whose covariance is Q N Q;
     - r <- A' r leads to the row before.
 
-    Rows of C that did not arrive are left out. Rows before the first at which all of an unknown start had been heard
-    stay NaN.
+    A filter predicts before its first row too, so that row has a noise of the plant. Rows of C that did not arrive are
+    left out. Rows before the first at which all of an unknown start had been heard stay NaN.
 
     Args:
         A: transition (n, n).

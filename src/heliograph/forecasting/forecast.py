@@ -14,10 +14,11 @@ from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_i
 from heliograph.forecasting.multistep_prediction import (
     MultistepPredictor,
     find_output_claim,
-    make_multistep_predictor,
-    make_prediction,
-    predict_moments,
-    predict_moments_of_each,
+    find_received_claim,
+    look_ahead,
+    look_ahead_of_each,
+    make_outlook,
+    prediction_of,
 )
 from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.augmented.joint_sensors import joint_sensor
@@ -210,15 +211,14 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    claim = filter.claim
-    measured = outputs and make_prediction(
+    measured = outputs and prediction_of(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and make_prediction(received, target.received, claim, angles.received)
+    arriving = received and prediction_of(received, target.received, find_received_claim(filter), angles.received)
     return Forecast(
         steps=ahead.steps,
         time=ahead.time,
-        states=make_prediction(states, filter.states, claim, angles.states),
+        states=prediction_of(states, filter.states, filter.claim, angles.states),
         outputs=measured,
         received=arriving,
         inputs=ahead.inputs,

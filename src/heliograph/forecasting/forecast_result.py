@@ -25,8 +25,9 @@ class Prediction:
 
     Quantiles and probabilities are of the mixture; mean and covariance are its first two moments. The quantiles of an
     angle go on from its mean, so that a band about pi stays a band. Of several sources all arrays have one more axis,
-    of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`) the deviation is infinite,
-    and so are the ends of intervals; a probability there is none, NaN.
+    of sources, before that of horizons. Of what nothing has been heard yet (`hg.diffuse`), and behind noise that has no
+    variance (`StudentT` of at most two degrees), the deviation is infinite, and so are the ends of intervals; a
+    probability there is none, NaN.
 
     Args:
         names: of the numbers, m of them.

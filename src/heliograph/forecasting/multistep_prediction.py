@@ -3,6 +3,7 @@
 A filter's claim is what it says of its covariance: "exact", "upper", "nominal" or "none". Mixtures have K parts.
 """
 
+from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -11,18 +12,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
-from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
-from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
+from heliograph.factors.columns import WeightedColumns
+from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
+from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
-from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
-from heliograph.filters.gaussian.signal_moments import find_signal_moments
+from heliograph.filters.gaussian.adaptive import AdaptiveFilter
+from heliograph.filters.gaussian.belief import second_moments_at_start
+from heliograph.filters.gaussian.robust import RobustFilter
+from heliograph.filters.gaussian.signal import signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
+from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.filters.wrappers.state_limits import LimitedFilter
-from heliograph.forecasting.forecast_result import Prediction
-from heliograph.model.estimate import Claim, weakest
+from heliograph.forecasting.prediction import Prediction
+from heliograph.model.estimate import Claim, Innovation, weakest
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
@@ -30,7 +35,8 @@ from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memories_of_channels import memories
+from heliograph.random_affine.memory import memories
+from heliograph.random_affine.outliers import StudentT
 
 BLOCK = 128  # plants side by side under XLA
 
@@ -110,22 +116,28 @@ class MultistepPredictor(Module):
             mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
             return Moments(jnp.ones(1), mean[None], mark_unknown(covariance + noise, unknown)[None])
 
+        # The sensor's noise, as it was learned where the filter learns it.
+        learned: WeightedColumns | None = None
+        if isinstance(self.filter, AdaptiveFilter):
+            learned = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
+
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""
-            signal = find_signal_moments(plant, sensor, self.transform, from_covariance(mean, covariance), start)
+            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start, learned)
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
+        # Student's law of at most two degrees has no variance.
+        if isinstance(sensor.noise, StudentT):
+            endless = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
+            covariances = jax.vmap(lambda covariance: mark_unknown(covariance, endless))(covariances)
         return Moments(weights=states.weights, means=means, covariances=covariances)
 
     def predict_received(self, prior: PyTree, k: jax.Array) -> Moments | None:
-        """Return the moments of what would arrive at step k, by the predicted state; None where the filter cannot tell.
-
-        Of z = 0 the innovation is minus what is expected, with the covariance of what arrives.
-        """
+        """Return the moments of what would arrive at step k, by the predicted state; None if the filter cannot tell."""
         if not self.receives:
             return None
-        _, innovation = self.filter.correct(prior, jnp.zeros(self.filter.received), k)
+        innovation = _expect(self.filter, prior, k)
         return Moments(jnp.ones(1), -jnp.asarray(innovation.value)[None], jnp.asarray(innovation.covariance)[None])
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
@@ -138,9 +150,20 @@ class MultistepPredictor(Module):
         return prior, (states, outputs, received)
 
 
-def make_multistep_predictor(
-    filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None
-) -> MultistepPredictor:
+def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
+    """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
+    if isinstance(filter, LimitedFilter):
+        return _expect(filter.base, filter.hold(prior), k)
+    if isinstance(filter, ToldFilter):  # zeros would tell a law
+        return filter.expect(prior, k)
+    _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
+    if isinstance(filter, RobustFilter):  # whose law of noise may have no variance
+        has_none = jnp.asarray(at(filter.noise, k).degrees) <= 2
+        return replace(innovation, covariance=mark_unknown(jnp.asarray(innovation.covariance), has_none))
+    return innovation
+
+
+def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
     """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant
@@ -253,3 +276,11 @@ def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Cl
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])
+
+
+def find_received_claim(filter: AbstractFilter) -> Claim:
+    """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical."""
+    base = filter.base if isinstance(filter, LimitedFilter) else filter
+    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
+        return weakest([filter.claim, "nominal"])
+    return filter.claim

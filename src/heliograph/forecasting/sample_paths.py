@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.gaussian.adaptive import AdaptiveFilter
 from heliograph.filters.modes.multiple_model import ModalBeliefs, MultipleModelFilter
 from heliograph.forecasting.forecast import ForecastTarget, check_steps_covered, find_target
 from heliograph.forecasting.horizons import Horizons, Inputs, check_inputs_ahead, find_rows_ahead
@@ -111,7 +112,11 @@ def draw_paths(
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, _find_switching(target))
+    believer = target.outlook.filter
+    learned = None
+    if isinstance(believer, AdaptiveFilter):
+        learned = np.asarray(believer.noise_deviations(target.state, origin.step))
+    x, y = _draw_from_starts(plant, sensor, starts, ahead.u, keys, step, _find_switching(target), learned)
     return Paths(
         steps=ahead.steps,
         time=ahead.time,
@@ -197,7 +202,8 @@ def _draw_paths_from_states(
     u: Array,
     keys: jax.Array,
     step: Array,
-    switching: ModeSwitching | None,
+    switching: Switching | None,
+    learned: Array | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.
 
@@ -209,6 +215,7 @@ def _draw_paths_from_states(
         keys: a random key for each path (draws,).
         step: number of the first row.
         switching: how modes move; None where there are none.
+        learned: deviations of the sensor's noise in units of its own (m,), where a filter learned them; else None.
     """
 
     def move(before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[Any, Any]:
@@ -225,7 +232,10 @@ def _draw_paths_from_states(
         if sensor_k is None:
             return (x, mode), (x, jnp.zeros(0))
         sensor_k = sensor_k.under(plant_k.inputs, u_k)
-        y = wrap_angles(sensor_k.measure(x) + sensor_k.noise.sample(key_of_sensor), sensor_k.angles)
+        law, noise = sensor_k.noise, sensor_k.noise.sample(key_of_sensor)
+        if learned is not None:
+            noise = law.mean + jnp.asarray(learned) * (noise - law.mean)
+        y = wrap_angles(sensor_k.measure(x) + noise, sensor_k.angles)
         return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -11,9 +11,9 @@ from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, join_all_nodes, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.long_run_covariance import student_quantile
-from heliograph.learning.parametric_network import Build, describe
-from heliograph.learning.unidentified_directions import (
+from heliograph.learning.parameters import Parameters
+from heliograph.learning.told_numbers import TellsNumbers
+from heliograph.learning.unidentified import (
     WEAK,
     ConfoundedNumbers,
     InformationRank,
@@ -88,7 +88,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
         seed: seed of the data and of the points (default 0).
 
     Raises:
-        ValueError: as `fit`.
+        ValueError: as `fit`; numbers that messages tell, of which no law is known.
     """
     description = describe(network)
     objective = make_objectives(description)[-1]
@@ -243,13 +243,23 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         """Return the filter's state after row k, and the measurement drawn for it."""
         k, u_k, noise = row
-        prior = filter.predict(state, u_k, k)
-        # The innovation of z = 0 is -E z, with covariance S.
-        received = filter.correct(prior, jnp.zeros(filter.received), k)[1]
-        z = cholesky(jnp.asarray(received.covariance)) @ noise - received.value
+        prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
+        # What a message tells of its link is drawn first: it gives the law of the rest.
+        numbers = jnp.zeros(0)
+        if isinstance(filter, TellsNumbers):
+            numbers = filter.draw_numbers(jax.random.fold_in(key_of_numbers, k), k)
+            zeros = filter.with_numbers(zeros, numbers)
+        # The innovation of z = 0 is -E z, with covariance S; of what is told both are NaN.
+        received = filter.correct(prior, zeros, k)[1]
+        is_value = ~jnp.isnan(received.value)
+        S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
+        z = cholesky(S) @ noise - received.value
+        if isinstance(filter, TellsNumbers):
+            z = filter.with_numbers(z, numbers)
         return filter.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, filter.init())
+    key_of_numbers = jax.random.fold_in(key, 1)
     noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
     measurements: jax.Array = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
     return measurements

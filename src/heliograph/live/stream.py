@@ -134,15 +134,18 @@ class Stream:
         # Note the step if a value came of a sender that decides when to send: its silence counts from there.
         if compiled.values and not np.isnan(z[: compiled.values]).all():
             self._last = k
-        # What was refused, and warnings: of readings, of the filter's state, of angles. What is unexpected is counted.
-        self._count_readings(screened, z)
+        # What was refused and what is unexpected are counted. What is to be said of readings, the filter's state and
+        # angles comes last, when all is done: where warnings are errors, the step counts too.
+        lines = self._count_readings(screened, z)
         if self.filter.remarks:
-            self._warn_of_remark()
+            lines += self._describe_remark()
         nis, arrived = stepper.judgement[:2].tolist()
         if arrived and not math.isnan(nis):
-            self._count_unexpected(nis > compiled.rare[int(arrived)])
+            lines += self._count_unexpected(nis > compiled.rare[int(arrived)])
         if self._angles.states or self._angles.received:
-            self._warn_of_angles(z, k)
+            lines += self._describe_angles(z, k)
+        for line in lines:
+            warnings.warn(f"stream, {line}", stacklevel=2)
         return self._make_estimate(nis, int(arrived))
 
     def _convert_sample(self, measurement: ArrayLike, inputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -185,8 +188,8 @@ class Stream:
         found = self._repeats.found or [0] * self.filter.received
         return np.array(found, dtype=np.int64)
 
-    def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> None:
-        """Count what was screened; where none is stuck by rule, warn of the first run of each component that is."""
+    def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> list[str]:
+        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is."""
         if screened is not None:
             for reason, more in count_by_reason(screened.refused).items():
                 self.refused[reason] += more
@@ -194,31 +197,28 @@ class Stream:
         # `found`: by component how many runs were too long so far; () before the first reading.
         found_before, watch = self._repeats.found, self._watch
         if watch is None:
-            return
+            return []
         self._repeats = watch.extend_runs(z.tolist(), self._repeats)
-        for i, count in enumerate(self._repeats.found if self._repeats.found != found_before else ()):
-            if count == 1 and not (found_before and found_before[i]):
-                said = watch.describe_stuck_output(i, f"received number {i}", self._repeats)
-                warnings.warn(f"stream, step {self.steps - 1}: {said}", stacklevel=3)
+        found = self._repeats.found if self._repeats.found != found_before else ()
+        first_runs = [i for i, count in enumerate(found) if count == 1 and not (found_before and found_before[i])]
+        said = [watch.describe(i, f"received number {i}", self._repeats) for i in first_runs]
+        return [f"step {self.steps - 1}: {words}" for words in said]
 
-    def _warn_of_remark(self) -> None:
-        """Warn of what the filter says of its state, such as that a gate gave in, where it is new."""
-        said = self.filter.remark(self._compiled.state.unflatten(self._stepper.state))
-        if said.times > self._remarked:
-            warnings.warn(f"stream, {said.words}", stacklevel=3)
+    def _describe_remark(self) -> list[str]:
+        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none."""
+        said, before = self.filter.remark(self._compiled.state.unflatten(self._stepper.state)), self._remarked
         self._remarked = said.times
+        return [said.words] if said.times > before else []
 
-    def _warn_of_angles(self, z: np.ndarray, k: int) -> None:
-        """Warn of angles that are known less well than the filter can use, and of received ones in degrees, once."""
+    def _describe_angles(self, z: np.ndarray, k: int) -> list[str]:
+        """Return lines on angles known less well than the filter can use, and on received ones in degrees, once."""
         wide = self._angles.said_of(np.diagonal(self._stepper.estimate[1])[None])
-        for _, line in (*wide, *self._angles.doubt_unit(z[None])):
-            warnings.warn(f"stream, step {k}: {line}", stacklevel=3)
+        return [f"step {k}: {line}" for _, line in (*wide, *self._angles.doubt_unit(z[None]))]
 
-    def _count_unexpected(self, beyond: bool) -> None:
-        """Count unexpected measurements in a row (`beyond`: this was one), and warn at the BEYOND-th."""
+    def _count_unexpected(self, beyond: bool) -> list[str]:
+        """Count unexpected measurements in a row (`beyond`: this was one); return a line at the BEYOND-th."""
         self._beyond = self._beyond + 1 if beyond else 0
-        if self._beyond == BEYOND:
-            warnings.warn(f"stream, step {self.steps - 1}: {self.doubt}", stacklevel=3)
+        return [f"step {self.steps - 1}: {self.doubt}"] if self._beyond == BEYOND else []
 
     def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
         """Raise ValueError if the step's inputs u or measurement z are implausible; else accept the flagged step.

@@ -180,7 +180,7 @@ class Timeline:
         plant, clock_before = self._plant, self._plant.clock
         screened = self._fleet.screen_event(node, self._convert_event(node, sequence, time, values, arrival), plant)
         event = screened.event
-        verdict = self._fleet.take_event(plant, event, arrival_known=arrival is not None)
+        verdict, lines = self._fleet.take_event(plant, event, arrival is not None), list[str]()
         if verdict == "used":
             row, _ = plant.changes[-1]  # that which holds the event now
             why = screened.why if screened.is_empty else self._explain_implausible(event, row)
@@ -190,11 +190,12 @@ class Timeline:
                 self._fleet.undo_events(plant, clock_before)
                 self._fleet.step([plant])
             else:
-                for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant])):
-                    warnings.warn(f"timeline, {line}", stacklevel=2)
+                lines += [line for _, line in (*self._angles.find_new([plant]), *self._remarks.find_new([plant]))]
                 self._finalise()
         self._fleet.count_event(plant, node, screened, verdict)
-        for _, line in self._held.find_new([plant]):
+        lines += [line for _, line in self._held.find_new([plant])]
+        # Last, when all is done: where warnings are errors, the event counts too.
+        for line in lines:
             warnings.warn(f"timeline, {line}", stacklevel=2)
         return verdict
 

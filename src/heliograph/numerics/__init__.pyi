@@ -151,6 +151,7 @@ from .times.dates import looks_like_date as looks_like_date
 from .times.dates import parse_dates as parse_dates
 from .times.dates import parse_instant as parse_instant
 from .times.dates import parse_moment as parse_moment
+from .times.dates import read_compact_date as read_compact_date
 from .times.dates import seconds_between as seconds_between
 from .times.dates import unequal_steps as unequal_steps
 from .times.row_times import backwards_text as backwards_text

@@ -249,8 +249,9 @@ def _choose_cells(system: _ScalarSystem, delta: float, share: float) -> _CellGri
     if cells_each_side > POINTS:
         raise fail(
             "plant, sensor and delta",
-            f"a measurement whose deviation is at most {POINTS // 11} times that of either noise, and of delta",
-            f"{measured / min(np.sqrt(q), np.sqrt(r), delta):.3g} times",
+            f"a measurement whose deviation is at most {POINTS / HELD:.3g} cells of the grid (of at most {share:g} of "
+            "the deviation of either noise, and of 2 delta)",
+            f"{measured / h:.3g} cells of {h:.3g}",
         )
     return _CellGrid(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.filter_for_likelihood import likelihood_filter
-from heliograph.model.augmented.joint_sensors import join_links
+from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.learning.told_numbers import TellsNumbers
+from heliograph.model.enlarged.joint_sensors import join_links
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.angle import wrap_angles
@@ -240,17 +241,20 @@ def _compute_squares_at_end(
 ) -> Float[np.ndarray, "runs n"]:
     """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
-    One run stands for all where variances are exact and the same rows arrive in all of them.
+    One run stands for all where variances are exact, and the same rows arrive in all of them and tell the same.
     """
     squares, used = [], filter.angles_used()
-    # What arrives decides the variances: with one pattern of NaN they are the same in all runs.
-    alike = exact and np.array_equal(np.isnan(z), np.broadcast_to(np.isnan(z[:1]), z.shape))
+    # What arrives decides the variances, and what a message tells of its link: where both are the same in all runs,
+    # so are they.
+    is_number = np.isin(np.arange(z.shape[-1]), filter.numbers if isinstance(filter, TellsNumbers) else ())
+    deciding = np.where(is_number, z, np.isnan(z))
+    alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
     for row, x in zip(z, truth, strict=True):
         filtered = filter.run(row, u)
         if exact:
             squares.append(np.diagonal(filtered.covariances[-1]))
         else:
             squares.append(wrap_angles(filtered.means[-1] - x[-1], used.states if used else ()) ** 2)
-        if alike:  # the same rows arrive in all runs
+        if alike:
             break
     return np.array(squares)

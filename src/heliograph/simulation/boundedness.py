@@ -136,12 +136,15 @@ def _join_links(network: Network, states: int) -> JointLinks:
     `states`: number of the plant's.
 
     Raises:
-        ValueError: relays that filter, channels that vary, deliver late or have uncertain probabilities.
+        ValueError: no node that receives a sensor; relays that filter; channels that vary, deliver late or have
+            uncertain probabilities.
     """
     if network.relays is not None:
         raise fail("nodes", "ones that receive the sensors over channels", "relays that filter")
     # Sensors one above the other.
     nodes = [node for node in network.nodes.values() if isinstance(node, Node)]
+    if not nodes:
+        raise fail("nodes", "at least one that receives a sensor", "none")
     matrices, noises = zip(*(sensor_matrices(node.sensor, states) for node in nodes), strict=True)
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
     channels = [_read_constant_channel(node.channel) for node in nodes]

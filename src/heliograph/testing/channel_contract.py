@@ -121,11 +121,12 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
 
         `sample` draws by the key of the first draw; () of a map that remembers, which has no such function.
         """
-        key = jax.random.wrap_key_data(words)
-        start = channel.init(jax.random.fold_in(key, 2))
-        after_first, h_1 = channel.draw(start, key)
-        sampled = () if channel.remembers else channel.sample(key)
-        return start, after_first, h_1, *channel.draw(after_first, jax.random.fold_in(key, 1)), sampled
+        # A draw may split its key: keys of one split are no parts of each other, as fold_in(key, 1) is of split(key).
+        at_start, at_first, at_second = jax.random.split(jax.random.wrap_key_data(words), 3)
+        start = channel.init(at_start)
+        after_first, h_1 = channel.draw(start, at_first)
+        sampled = () if channel.remembers else channel.sample(at_first)
+        return start, after_first, h_1, *channel.draw(after_first, at_second), sampled
 
     # A state of constant structure, and `draw` equal to `sample` without memory.
     with jax.enable_x64(True):

@@ -225,3 +225,39 @@ def test_what_cannot_take_an_unknown_start_says_so_in_one_line(build, said):
     with pytest.raises(ValueError, match=said) as error:
         build()
     assert "\n" not in str(error.value)
+
+
+def test_what_was_told_of_an_unknown_direction_is_not_told_again_by_rounding():
+    """Two sensors that show one sum of two unknown states: one direction is learned, and the other has no number.
+
+    s_inf = 1.4^2 (.81^2 + .37^2) of the first sensor; the second is of the mean 1.67 / 1.4 times its value.
+    """
+    plant = hg.LinearPlant([[1.44, -0.63], [-0.81, -0.37]], np.zeros((2, 2)), [0.0, 0.0], hg.diffuse)
+    both = hg.LinearSensor([[0.0, -1.4], [0.0, -1.67]], np.diag([0.1, 1.0]))
+    found = hg.kalman_filter(plant, both).run([[1.0, 2.0]])
+    information = 1.4**2 / 0.1 + 1.67**2
+    expected = [[np.inf, 0.0], [0.0, 1 / information]]
+    np.testing.assert_allclose(found.covariances[0], expected, rtol=1e-12)
+    ratio = 1.67 / 1.4
+    variance, error = 1 + ratio**2 * 0.1, 2 - ratio
+    log_likelihood = (
+        -np.log(1.4**2 * (0.81**2 + 0.37**2)) / 2 - (error**2 / variance + np.log(2 * np.pi * variance)) / 2
+    )
+    assert found.log_likelihoods[0] == pytest.approx(log_likelihood, rel=1e-12)
+
+
+def test_a_state_that_was_measured_is_known_beside_one_that_was_not():
+    plant = hg.LinearPlant([[-0.48, -0.35], [0.66, 0.14]], np.zeros((2, 2)), [0.0, 0.0], hg.diffuse)
+    found = hg.kalman_filter(plant, hg.LinearSensor([[0.0, 0.6]], 0.1)).run([[1.0]])
+    np.testing.assert_allclose(found.covariances[0], [[np.inf, 0.0], [0.0, 0.1 / 0.36]], rtol=1e-12)
+
+
+def test_an_unknown_level_that_cancels_in_a_prediction_is_not_left_there():
+    """x2+ = x0 - 3 x1 with x0 = 3 x1 unknown in thirds and tenths: known to be 0, though .3 - 3 x .1 is not."""
+    move = [[0.3, 0.0, 0.0], [0.1, 0.0, 0.0], [1.0, -3.0, 0.0]]
+    plant = hg.LinearPlant(
+        move, np.diag([0.0, 0.0, 0.2]), np.zeros(3), hg.diffuse(["x0"], 0.0), states=["x0", "x1", "x2"]
+    )
+    found = hg.kalman_filter(plant, hg.LinearSensor([[0.0, 0.0, 1.0]], 0.1)).run([[np.nan], [np.nan], [0.5]])
+    assert np.isinf(found.covariances[2, 0, 0])
+    assert found.covariances[2, 2, 2] == pytest.approx(1 / (1 / 0.2 + 1 / 0.1), rel=1e-12)

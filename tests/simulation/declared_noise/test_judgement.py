@@ -179,3 +179,4 @@ def test_what_no_scale_explains_is_said():
     judgement = hg.simulation.judge_declared(FILTER, rows)
     (line,) = judgement.sentences()
     assert judgement.contradicted and line.startswith("no scale explains the innovations")
+    assert np.isnan([one.scale for one in judgement.classes]).all()

@@ -132,6 +132,18 @@ class AdaptiveFilter(AbstractWrapper):
         variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
         return variances
 
+    def noise_deviations(self, state: AdaptiveBelief, k: Step = 0) -> Float[jax.Array, " outputs"]:
+        """Return deviations of the sensor's noise as they were learned, in units of its own, of each output.
+
+        They are those of the noise that brings it, of several received numbers their root mean square; of an output
+        that none brings 1.
+        """
+        noise = at(self.noise, k)
+        ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
+        brings = jnp.asarray(noise.output)  # (m, p): 1 where number i brings output a
+        count = jnp.sum(brings, axis=0)
+        return jnp.sqrt(jnp.where(count > 0, brings.T @ ratio / jnp.maximum(count, 1), 1.0))
+
 
 class VariationalUpdate(NamedTuple):
     """Result of one update: the state, a and b of the variances' law, predicted covariance of z, weights of components.

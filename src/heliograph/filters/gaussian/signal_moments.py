@@ -100,16 +100,14 @@ def find_signal_moments(
 def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
 
-    Rounding acts on numbers of this size. It is taken at the start, once: the present estimate would make covariances
-    of a linear filter depend on data, and E[x_i^2] before data grows without end where only inputs hold a plant.
+    The noise counts without its outliers: Student's law of at most two degrees has no variance.
 
-    Args:
-        sensor: H and the law of v.
-        start: E[x_i^2] of the n states at the start, before any data (n,).
+    `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
+    moments before data grow without end where only inputs hold a plant.
     """
     law = sensor.noise
     reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
-    size: jax.Array = reach**2 + diagonal(law.covariance)
+    size: jax.Array = reach**2 + diagonal(law.without_outliers().covariance)
     return size
 
 

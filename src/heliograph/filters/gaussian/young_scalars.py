@@ -42,6 +42,13 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     fixed = jax.lax.stop_gradient(parts)
     free = jnp.isnan(given)
 
+    def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
+        """Return log beta after a step of Newton's method for the free scalars alone: f(t) = t of a given one."""
+        zero_if_given = [
+            [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
+        ]
+        return newton_step(t, jnp.where(free, refined, t), zero_if_given)
+
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         """Return whether a free scalar still moves, and sweeps are left."""
         t, previous, sweeps = carry
@@ -52,14 +59,14 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
         """Return the next t = log beta, the one before it, and the number of sweeps."""
         t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)
-        return jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes)), t, sweeps + 1
+        return jnp.where(free & (sweeps == 0), refined, move(t, refined, slopes)), t, sweeps + 1
 
     # Newton's method on the logarithms, until they stay; where scalars are given it does not begin (|t - t| = 0).
     first = jnp.log(jnp.where(free, START, given))
     t, _, _ = jax.lax.while_loop(goes_on, iterate, (first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)))
     # One Newton step with derivatives, dt = (I - J)^-1 df; given scalars are returned whatever it says.
     refined, slopes = sweep(t, *parts)
-    return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
+    return jnp.where(free, jnp.exp(move(t, refined, jax.lax.stop_gradient(slopes))), given)
 
 
 def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:

@@ -73,8 +73,7 @@ class LimitedFilter(AbstractSizedFilter):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct the prediction, its mean held within the limits."""
-        prior = state if _holds_particles(state) else self._hold_means(state)
-        after, innovation = self.base.correct(prior, z, k)
+        after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_within_after, log_within_before = self._log_probability_within(after), self._log_probability_within(state)
         are_possible = jnp.isfinite(log_within_after) & jnp.isfinite(log_within_before)
@@ -90,7 +89,11 @@ class LimitedFilter(AbstractSizedFilter):
         """Return the mean and covariance after step k, given that the state lies within the limits."""
         return self._with_own_claim(self.base.after_step(self.condition_on_limits(state), k))
 
-    def condition_on_limits(self, state: PyTree) -> PyTree:
+    def hold(self, state: PyTree) -> PyTree:
+        """Return the state from which the filter within corrects: the mean of a Gaussian held within the limits."""
+        return state if _is_particles(state) else self._hold_means(state)
+
+    def condition(self, state: PyTree) -> PyTree:
         """Return the state of the filter within, given that the plant's state lies within the limits."""
         return self._condition_with_log_probability(state)[1]
 

@@ -42,7 +42,7 @@ from heliograph.random_affine.channel_state_information import (
     make_laws_certain,
     numbers_give_law,
 )
-from heliograph.random_affine.moments.second_moments import second_order
+from heliograph.random_affine.untold_law import believe_untold, draw_told, has_untold_law
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
 
@@ -94,6 +94,27 @@ class ToldFilter(AbstractWrapper):
         # Numbers that give no law make the state NaN, so that the message is refused where it came in.
         after = _spoil_state(after, ~is_law & ~jnp.all(jnp.isnan(values)))
         return after, self._place_innovation(innovation)
+
+    def expect(self, state: PyTree, k: Step = 0) -> Innovation:
+        """Return minus what is expected to arrive at step k, with its covariance, before a message tells anything.
+
+        Of the link by the law of its numbers, or of typical ones where that is unknown (`knows_law_of_numbers`).
+        """
+        filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
+        return self._place_innovation(filter.correct(state, jnp.zeros(len(self.values)), k)[1])
+
+    def draw_numbers(self, key: jax.Array, k: Step = 0) -> jax.Array:
+        """Draw the numbers that a message tells at step k by their laws; raise ValueError where one has none."""
+        return draw_told(at(self.link, k), key)
+
+    def with_numbers(self, z: jax.Array, numbers: jax.Array) -> jax.Array:
+        """Return a message with these numbers in the place of its own."""
+        return z.at[np.array(self.numbers)].set(numbers)
+
+    @property
+    def knows_law_of_numbers(self) -> bool:
+        """True if `expect` is by the law of the numbers, not by typical ones."""
+        return has_untold_law(first(self.link))
 
     def _place_innovation(self, innovation: Innovation) -> Innovation:
         """Return the innovation of the values at their rows of z.

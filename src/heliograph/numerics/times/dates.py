@@ -216,3 +216,25 @@ def _parse_horizon(text: str) -> float | np.timedelta64 | np.datetime64:
         return float(text)
     except ValueError:
         raise fail("horizon", "a number of steps, or spans and dates as 5s,1min,2026-12-01", show_value(text)) from None
+
+
+def read_compact_date(numbers: np.ndarray) -> str | None:
+    """Return the first of some numbers as a date if all read as YYYYMMDD, or so with hours and minutes or seconds.
+
+    None where one does not, or where they are no numbers. Dates are of the years 1900 to 2099.
+    """
+    if numbers.dtype.kind not in "fiu" or not len(numbers) or not np.all(numbers == np.floor(numbers)):
+        return None
+    days_of_month = np.array([31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
+    for clock_limits in ((), (60, 24), (60, 60, 24)):
+        # Two digits after two from the right: seconds, minutes and hours, the day, the month, and four of the year.
+        rest, fits = np.asarray(numbers), True
+        for limit in clock_limits:
+            rest, fits = rest // 100, fits and bool(np.all(rest % 100 < limit))
+        day, month, year = rest % 100, rest // 100 % 100, rest // 10000
+        fits = fits and bool(np.all((year >= 1900) & (year < 2100) & (month >= 1) & (month <= 12) & (day >= 1)))
+        if fits and np.all(day <= days_of_month[month.astype(int) - 1]):
+            first = f"{numbers[0]:.0f}"
+            clock = ":".join(first[i : i + 2] for i in range(8, len(first), 2))
+            return f"{first[:4]}-{first[4:6]}-{first[6:8]}" + (f"T{clock}" if clock else "")
+    return None

@@ -50,7 +50,7 @@ class DeclaredClass(NamedTuple):
         nis: mean square of the innovations over their claimed variance; 1 where the claim holds.
         nis_low: lower end of the interval in which it is for a true claim, in 99 of 100 recordings for all classes.
         nis_high: upper end.
-        scale: factor of the declared variances that fits best, without a bias; 1 where nothing contradicts them.
+        scale: factor of the declared variances that fits best, without a bias; 1 if none is needed, NaN if none fits.
         scale_low: lower end of its 95 % interval.
         scale_high: upper end.
     """
@@ -226,7 +226,8 @@ def _judge_link(
     after = examine_innovations(declared, refit_filter(declared, refit.logs), classes)
     bias = _find_bias(declared, refit) if after.p_value < LEVEL else None
     low, high = ([find_interval_end(declared, refit, c, sign) for c in range(declared.classes)] for sign in (-1, 1))
-    scales = np.exp(refit.logs), np.exp(low), np.exp(high)  # of each class, with the ends of their intervals
+    # The scale of each class, with the ends of its interval.
+    scales = np.exp(refit.logs if refit.found else np.nan * refit.logs), np.exp(low), np.exp(high)
     return _make_judgement(declared, classes, (before, after), scales, bias), heard
 
 
@@ -384,7 +385,7 @@ def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
 
 def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
     """Return a line on how much too large or small a class's variances are, if any; it is named if `several` are."""
-    if one.scale_low < LEAST and one.scale_high > 1 / LEAST:
+    if np.isnan(one.scale) or (one.scale_low < LEAST and one.scale_high > 1 / LEAST):
         return []
     times, low, high = one.scale, one.scale_low, one.scale_high
     kind = "small"

@@ -225,6 +225,11 @@ class Refit(NamedTuple):
     logs: Float[np.ndarray, " numbers"]
     likelihood: float
 
+    @property
+    def found(self) -> bool:
+        """Whether the numbers give the recording a likelihood."""
+        return self.likelihood > -LOST
+
 
 def refit_scales(declared: DeclaredRows) -> Refit:
     """Return the scale of each class that fits best, with everything else as the filter has it."""
