@@ -104,7 +104,7 @@ def read_measured_plants(
     path = open_path_or_store(location)
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
-        if options.of_messages or lag is not None:
+        if options.are_for_messages or lag is not None:
             raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import heliograph
-from heliograph.cli.app import estimates_option, measured_option, path_option
-from heliograph.cli.filtered_blocks import SaidOfBlocks, WrittenRows, run_in_blocks
-from heliograph.cli.filtered_plant import FilteredPlant, filter_plant, place_of_plant, write_plant_estimates
-from heliograph.cli.reading import ReadingOptions, read_measured
-from heliograph.files.stores.address import StoreAddress
+from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
+from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
+from heliograph.cli.measured_data import ReadingOptions, read_measured_plants
+from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
+from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -83,7 +83,9 @@ def run(
         said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
-        measured = [] if said_of_blocks else read_measured(measurements, network, loaded, module, options, advance, lag)
+        measured = (
+            [] if said_of_blocks else read_measured_plants(measurements, network, loaded, module, options, advance, lag)
+        )
         # Each plant by itself, with the place where its estimates were written.
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:

@@ -91,7 +91,7 @@ def lower_step_to_c_functions(
         # Mean and covariance of the estimate become members of their own only where no array of the state has the same
         # numbers after every part. So all are written once to see which results are the same; `holders` are the
         # numbers of the two candidates that hold mean and covariance.
-        with_all = [_write_part(part, symmetric, prefix, real, size) for part in parts]
+        with_all = [_lower_part_to_c(part, symmetric, prefix, real, size) for part in parts]
         numbers = range(len(read), len(candidates))
         holders = [_find_same_result(n, with_all, candidates) for n in numbers]
         kept = [*range(len(read)), *(n for n in holders if n >= len(read))]

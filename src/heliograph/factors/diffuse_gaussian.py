@@ -73,7 +73,7 @@ def _find_slopes(matrix: jax.Array, x: Diffuse) -> jax.Array:
     return jnp.where((x.infinite > 0) & (jnp.abs(slopes) <= DEAF * reach), 0.0, slopes)
 
 
-class LevelWeights(NamedTuple):
+class FiniteAndInfiniteWeights(NamedTuple):
     """Weights of columns (c,): finite ones, and infinite ones."""
 
     finite: jax.Array
@@ -130,8 +130,8 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w."""
-    rows, weights = _append_noise(_find_slopes(matrix, x), x, noise)
-    lower, levels, _ = triangularise_levels(rows, weights, len(x.mean))
+    rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
+    lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
 
 
@@ -251,7 +251,7 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     n = len(x.mean)
-    moved, weights = _append_noise(_find_slopes(matrix, x), x, noise)
+    moved, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
     lower, _, rest = triangularise_both_levels(jnp.concatenate([moved, own]), weights, n)
     left, levels, _ = triangularise_both_levels(rest[n:], weights, n, own**2 @ weights.infinite)

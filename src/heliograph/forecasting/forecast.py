@@ -15,10 +15,10 @@ from heliograph.forecasting.multistep_prediction import (
     MultistepPredictor,
     find_output_claim,
     find_received_claim,
-    look_ahead,
-    look_ahead_of_each,
-    make_outlook,
-    prediction_of,
+    make_multistep_predictor,
+    make_prediction,
+    predict_moments,
+    predict_moments_of_each,
 )
 from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.augmented.joint_sensors import joint_sensor
@@ -211,14 +211,14 @@ def _forecast_target(target: ForecastTarget, origin: Origin, ahead: RowsAhead) -
     states, outputs, received = jax.tree.map(lambda leaf: np.take(leaf, ahead.rows, axis=int(origin.several)), moments)
     assert states is not None
     angles, sensor = filter.angles_used() or FilterAngles((), ()), first(outlook.sensor)
-    measured = outputs and prediction_of(
+    measured = outputs and make_prediction(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, target.received, find_received_claim(filter), angles.received)
+    arriving = received and make_prediction(received, target.received, find_received_claim(filter), angles.received)
     return Forecast(
         steps=ahead.steps,
         time=ahead.time,
-        states=prediction_of(states, filter.states, filter.claim, angles.states),
+        states=make_prediction(states, filter.states, filter.claim, angles.states),
         outputs=measured,
         received=arriving,
         inputs=ahead.inputs,

@@ -12,21 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.engine.choice import choose_code, compile_on_call, compute_once
-from heliograph.factors.columns import WeightedColumns
-from heliograph.factors.diffuse import Diffuse, mark_unknown, project_diffuse
-from heliograph.factors.gaussian import Gaussian, from_covariance, take_leading
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
+from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian.adaptive import AdaptiveFilter
-from heliograph.filters.gaussian.belief import second_moments_at_start
+from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
+from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
 from heliograph.filters.gaussian.robust import RobustFilter
-from heliograph.filters.gaussian.signal import signal_of
-from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.mode_observed import ModeObservedFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
-from heliograph.filters.wrappers.reported_law import ToldFilter
 from heliograph.filters.wrappers.state_limits import LimitedFilter
-from heliograph.forecasting.prediction import Prediction
+from heliograph.filters.wrappers.told_link_law import ToldFilter
+from heliograph.forecasting.forecast_result import Prediction
 from heliograph.model.estimate import Claim, Innovation, weakest
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
@@ -35,8 +35,8 @@ from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.random_affine.memory import memories
-from heliograph.random_affine.outliers import StudentT
+from heliograph.random_affine.memories_of_channels import memories
+from heliograph.random_affine.outlier_noise import StudentT
 
 BLOCK = 128  # plants side by side under XLA
 
@@ -123,7 +123,9 @@ class MultistepPredictor(Module):
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return the mean and covariance of the outputs, under one part of the mixture of states."""
-            signal = signal_of(plant, sensor, self.transform, from_covariance(mean, covariance), start, learned)
+            signal = find_signal_moments(
+                plant, sensor, self.transform, from_covariance(mean, covariance), start, learned
+            )
             return signal.mean, signal.covariance
 
         means, covariances = jax.vmap(of_part)(states.means, states.covariances)
@@ -163,7 +165,9 @@ def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
     return innovation
 
 
-def make_outlook(filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None) -> Outlook:
+def make_multistep_predictor(
+    filter: AbstractFilter, sensor: AnySensor | None = None, plant: AnyPlant | None = None
+) -> MultistepPredictor:
     """Return the outlook of a filter, by the plant and sensor that it believes in, or by these if it does not say."""
     premise = filter.premise
     plant = plant if premise is None else premise.plant

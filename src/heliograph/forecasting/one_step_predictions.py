@@ -11,9 +11,15 @@ from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.run_over_data import check_data
 from heliograph.forecasting.backtest import list_single_filters, select_measurements
 from heliograph.forecasting.forecast import Forecasts, list_targets
-from heliograph.forecasting.origins import origin_of
-from heliograph.forecasting.outlook import Outlook, find_output_claim, find_received_claim, make_outlook, prediction_of
-from heliograph.forecasting.prediction import Forecast
+from heliograph.forecasting.forecast_result import Forecast
+from heliograph.forecasting.multistep_prediction import (
+    MultistepPredictor,
+    find_output_claim,
+    find_received_claim,
+    make_multistep_predictor,
+    make_prediction,
+)
+from heliograph.forecasting.start_states import find_origin
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import quickly_compiled
@@ -92,7 +98,7 @@ def _make_forecast(outlook: MultistepPredictor, z: np.ndarray, u: np.ndarray, na
     measured = outputs and make_prediction(
         outputs, tuple(sensor.outputs), find_output_claim(filter, outlook), sensor.angles
     )
-    arriving = received and prediction_of(received, names, find_received_claim(filter), angles.received)
+    arriving = received and make_prediction(received, names, find_received_claim(filter), angles.received)
     return Forecast(
         steps=np.ones(len(z), int),
         time=np.arange(float(len(z))),

@@ -116,7 +116,7 @@ def draw_paths(
     learned = None
     if isinstance(believer, AdaptiveFilter):
         learned = np.asarray(believer.noise_deviations(target.state, origin.step))
-    x, y = _draw_from_starts(plant, sensor, starts, ahead.u, keys, step, _find_switching(target), learned)
+    x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, _find_switching(target), learned)
     return Paths(
         steps=ahead.steps,
         time=ahead.time,
@@ -202,7 +202,7 @@ def _draw_paths_from_states(
     u: Array,
     keys: jax.Array,
     step: Array,
-    switching: Switching | None,
+    switching: ModeSwitching | None,
     learned: Array | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (draws, rows, n) and outputs (draws, rows, m) of drawn paths; m = 0 without a sensor.

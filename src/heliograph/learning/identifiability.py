@@ -11,9 +11,10 @@ from heliograph.learning.free_parameters import Parameters
 from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.objective import Objective, join_all_nodes, make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.parameters import Parameters
+from heliograph.learning.long_run_covariance import student_quantile
+from heliograph.learning.parametric_network import Build, describe
 from heliograph.learning.told_numbers import TellsNumbers
-from heliograph.learning.unidentified import (
+from heliograph.learning.unidentified_directions import (
     WEAK,
     ConfoundedNumbers,
     InformationRank,

@@ -201,7 +201,7 @@ class Stream:
         self._repeats = watch.extend_runs(z.tolist(), self._repeats)
         found = self._repeats.found if self._repeats.found != found_before else ()
         first_runs = [i for i, count in enumerate(found) if count == 1 and not (found_before and found_before[i])]
-        said = [watch.describe(i, f"received number {i}", self._repeats) for i in first_runs]
+        said = [watch.describe_stuck_output(i, f"received number {i}", self._repeats) for i in first_runs]
         return [f"step {self.steps - 1}: {words}" for words in said]
 
     def _describe_remark(self) -> list[str]:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.likelihood_filter import likelihood_filter
+from heliograph.filters.filter_for_likelihood import likelihood_filter
 from heliograph.learning.told_numbers import TellsNumbers
-from heliograph.model.enlarged.joint_sensors import join_links
+from heliograph.model.augmented.joint_sensors import join_links
 from heliograph.model.over_time import at_each_step, first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.angle import wrap_angles

@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.hop import GainAndNoise
-from heliograph.random_affine.laws.law import AbstractLaw, Discrete
-from heliograph.random_affine.mixture import Mixture
-from heliograph.random_affine.reported_law import (
-    AbstractTold,
+from heliograph.random_affine.channel_state_information import (
+    AbstractToldMap,
     FreshNumbers,
     PilotedHop,
     ToldGainHop,
     ToldMap,
-    told_maps,
+    list_told_maps,
 )
+from heliograph.random_affine.hop import GainAndNoise
+from heliograph.random_affine.laws.law import AbstractLaw, Discrete
+from heliograph.random_affine.mixture import Mixture
 
 T = TypeVar("T")
 
@@ -30,35 +30,35 @@ def believe_untold(channel: T) -> T:
 
     def believe(leaf: object) -> object:
         """Return a map by the law of its numbers, anything else as it is."""
-        if not isinstance(leaf, AbstractTold):
+        if not isinstance(leaf, AbstractToldMap):
             return leaf
         untold = _find_untold(leaf)
         return leaf.believed(leaf.typical) if untold is None else untold
 
-    known: T = jax.tree.map(believe, channel, is_leaf=_is_told)
+    known: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
     return known
 
 
 def has_untold_law(channel: AbstractRandomAffine) -> bool:
     """Return whether `believe_untold` has the law of all that arrives: no numbers are typical, or told of two maps."""
-    maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told) if isinstance(leaf, AbstractTold)]
+    maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
     shared = Counter(affine.memory.identity for affine in maps)
     return all(_find_untold(affine) is not None for affine in maps) and max(shared.values(), default=0) <= 1
 
 
 def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
-    """Draw what a message tells of all maps of a channel, in the order of `told_maps`.
+    """Draw what a message tells of all maps of a channel, in the order of `list_told_maps`.
 
     Raises:
         ValueError: numbers whose law nobody knows.
     """
-    memories = [affine.memory for affine in told_maps(channel)]
+    memories = [affine.memory for affine in list_told_maps(channel)]
     keys = jax.random.split(key, len(memories))
     drawn = [memory.announce(memory.begin(key)) for memory, key in zip(memories, keys, strict=True)]
     return jnp.concatenate([jnp.ravel(jnp.asarray(told, dtype=float)) for told in drawn])
 
 
-def _find_untold(affine: AbstractTold) -> AbstractRandomAffine | None:
+def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:
     """Return a map by the law of the numbers that are told; None where there is none, or more than finitely many."""
     if isinstance(affine, PilotedHop):  # known before its reading by the law of its gain
         return GainAndNoise(affine.memory.law, affine.matrix, affine.noise)
@@ -73,6 +73,6 @@ def _find_untold(affine: AbstractTold) -> AbstractRandomAffine | None:
     return Mixture(maps, law.probabilities)
 
 
-def _is_told(leaf: object) -> bool:
+def _is_told_map(leaf: object) -> bool:
     """Return whether an object is a map of which numbers are told."""
-    return isinstance(leaf, AbstractTold)
+    return isinstance(leaf, AbstractToldMap)

@@ -91,9 +91,9 @@ class LimitedFilter(AbstractSizedFilter):
 
     def hold(self, state: PyTree) -> PyTree:
         """Return the state from which the filter within corrects: the mean of a Gaussian held within the limits."""
-        return state if _is_particles(state) else self._hold_means(state)
+        return state if _holds_particles(state) else self._hold_means(state)
 
-    def condition(self, state: PyTree) -> PyTree:
+    def condition_on_limits(self, state: PyTree) -> PyTree:
         """Return the state of the filter within, given that the plant's state lies within the limits."""
         return self._condition_with_log_probability(state)[1]
 

@@ -42,6 +42,7 @@ from heliograph.random_affine.channel_state_information import (
     make_laws_certain,
     numbers_give_law,
 )
+from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.random_affine.untold_law import believe_untold, draw_told, has_untold_law
 
 ROUNDING = 1e-12  # share of squared gains: a spread below it is rounding
