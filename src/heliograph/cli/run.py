@@ -10,7 +10,7 @@ from cyclopts import Parameter
 import heliograph
 from heliograph.cli.app_and_option_types import estimates_option, measured_option, path_option
 from heliograph.cli.filter_plant import FilteredPlant, choose_output_of_plant, filter_plant, write_plant_estimates
-from heliograph.cli.measured_data import ReadingOptions, read_measured_plants
+from heliograph.cli.measured_data import MeasuredPlant, ReadingOptions, read_measured_plants
 from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_blocks
 from heliograph.files.stores.store_address import StoreAddress
 
@@ -83,9 +83,9 @@ def run(
         said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
             said_of_blocks = run_in_blocks(loaded, module, measurements, out, needing_all_rows, options, advance)
-        measured = (
-            [] if said_of_blocks else read_measured_plants(measurements, network, loaded, module, options, advance, lag)
-        )
+        measured = list[MeasuredPlant]()
+        if not said_of_blocks:
+            measured = read_measured_plants(measurements, network, loaded, module, options, advance, lag)
         # Each plant by itself, with the place where its estimates were written.
         done = list[tuple[FilteredPlant, Path | StoreAddress | None]]()
         for data in measured:
