@@ -12,6 +12,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
+from heliograph.filters.recursion import linear_start
 from heliograph.model.checks.inputs import check_inputs
 from heliograph.model.checks.row_times import check_dates, find_common_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -159,7 +160,9 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
         _check_later(before, dates)
-    start = () if before is None else (before.state, np.asarray(begin))
+    # The rows begin behind the state of those before, or of a linear filter behind its start, which is known.
+    state = linear_start(filter) if before is None else before.state
+    start = () if state is None else (state, np.asarray(begin))
     # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
     # return None where they do not apply.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row, *start)
