@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from heliograph.factors.columns import (
     WeightedColumns,
@@ -104,7 +105,7 @@ def signal_size_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     moments before data grow without end where only inputs hold a plant.
     """
     law = sensor.noise
-    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
+    reach = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))
     size: jax.Array = reach**2 + diagonal(law.covariance)
     return size
 
@@ -121,7 +122,7 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
-    rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
+    rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
     plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
@@ -156,7 +157,7 @@ def condition_on_measurement(
     value = z - expected
     after, innovations = condition_on_observation(x, slopes, value, noise, present)
     total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
-    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+    density = innovations.log_density(present, lax.abs(z) + lax.abs(expected))
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
 
@@ -171,4 +172,5 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
     """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
-    return jnp.concatenate([top, jnp.append(mean, last)[None]])
+    bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
+    return jnp.concatenate([top, bottom[None]])
