@@ -28,7 +28,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.modes_of_motion import ModalPlant
 from heliograph.model.over_time import at, first

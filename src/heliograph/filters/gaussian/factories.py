@@ -6,9 +6,7 @@ from heliograph.filters.gaussian.diffuse import DiffuseFilter, diffuse_filter, h
 from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channel_moments, make_perfect_channel
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
-from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_by_noise
 from heliograph.model.fading import memory_matters, without_memory

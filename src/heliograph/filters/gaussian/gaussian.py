@@ -15,7 +15,6 @@ from heliograph.filters.gaussian.signal import (
     make_received_noise,
     signal_of,
 )
-from heliograph.filters.gaussian.two_part_mean import center_filter
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.model.channel import Channel, perfect
@@ -107,6 +106,8 @@ class GaussianFilter(AbstractBeliefFilter):
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
+        from heliograph.filters.gaussian.two_part_mean import center_filter  # not before single precision needs it
+
         return center_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -19,13 +20,9 @@ from heliograph.filters.gaussian.gaussian import correct_signal, describe_channe
 from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
-from heliograph.filters.linear.given_record import LinearFilterOfRecord
-from heliograph.filters.linear.likelihood_scores import ScoreRecursion
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.reported_law import accept_told_numbers
-from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
@@ -34,16 +31,19 @@ from heliograph.model.over_time import OverTime, at, first, stacked
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, on_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import diagonal, symmetric
+from heliograph.numerics.linalg import diagonal, outer, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memory import is_modal
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outliers import has_bounded_noise
 from heliograph.random_affine.words.rounded import find_rounded
+
+if TYPE_CHECKING:  # what few calls need is loaded by them
+    from heliograph.filters.linear.likelihood_scores import ScoreRecursion
+    from heliograph.model.words.encoder import Words
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -116,7 +116,9 @@ class LinearFilter(AbstractSizedFilter):
         whole = stacked(self.channel)
         return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
 
-    def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
+    def score_rows(
+        self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
+    ) -> "ScoreRecursion":
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
 
         Args:
@@ -126,6 +128,8 @@ class LinearFilter(AbstractSizedFilter):
 
         Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
         """
+        from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
+
         return ScoreRecursion(make, x, half, informed=True)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -136,6 +140,8 @@ class LinearFilter(AbstractSizedFilter):
         """Return the same filter with covariances given its data where gains are random: else they are its own."""
         if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
             return self
+        from heliograph.filters.linear.given_record import LinearFilterOfRecord
+
         return LinearFilterOfRecord(filter=self, plant=self.plant, **make_sizes("nominal", self, self.received))
 
 
@@ -148,7 +154,7 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     matrix, law = jnp.asarray(sensor.matrix), sensor.noise
     mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
     noise = law.given_signal(mean, diagonal(explained))
-    second = explained + noise.covariance + jnp.outer(mean, mean)
+    second = explained + noise.covariance + outer(mean, mean)
     slopes = matrix @ state.gaussian.root
     return Signal(
         prior=state.gaussian,
@@ -182,7 +188,7 @@ def linear_filter(
     sensor: AnySensor,
     channel: Channel,
     update: Polytope | None = None,
-    encoder: Words | None = None,
+    encoder: "Words | None" = None,
 ) -> AbstractFilter:
     """Return the best linear filter for a linear plant and sensor behind any channel.
 
