@@ -19,7 +19,13 @@ from heliograph.filters.gaussian.belief import second_moments_at_start
 from heliograph.filters.gaussian.gaussian import correct_signal, describe_channel_moments
 from heliograph.filters.gaussian.signal import Signal, signal_size_at_start
 from heliograph.filters.gaussian.update import Polytope
-from heliograph.filters.linear.belief import LinearBelief, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.linear.belief import (
+    LinearBelief,
+    MomentsBeforeData,
+    motion_of_plant,
+    predict_belief,
+    prior_belief,
+)
 from heliograph.filters.linear.plan import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
@@ -33,7 +39,6 @@ from heliograph.model.premises.premise import believes, on_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import diagonal, outer, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memory import is_modal
@@ -111,10 +116,9 @@ class LinearFilter(AbstractSizedFilter):
         return True
 
     @property
-    def has_known_gain(self) -> bool:
-        """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
-        whole = stacked(self.channel)
-        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded(self.sensor))
+    def has_score_recursion(self) -> bool:
+        """Whether the channel's law is known and no noise depends on the signal but by a random gain."""
+        return not (stacked(self.channel).uncertain or find_rounded(self.sensor))
 
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
@@ -122,7 +126,7 @@ class LinearFilter(AbstractSizedFilter):
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
 
         Args:
-            make: the filter by the free numbers, one that `has_known_gain`.
+            make: the filter by the free numbers, one that `has_score_recursion`.
             x: the free numbers.
             half: number of the first row of the second half of the recording, of which information is summed apart.
 
@@ -130,7 +134,8 @@ class LinearFilter(AbstractSizedFilter):
         """
         from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
 
-        return ScoreRecursion(make, x, half, informed=True)
+        known_gain = not np.any(np.asarray(stacked(self.channel).gain_spread))
+        return ScoreRecursion(make, x, half, known_gain, informed=True)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -151,17 +156,13 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     They depend on the error covariance and the state's moments before data alone, not on the estimate, so that
     derivatives by the estimate do not involve them.
     """
-    matrix, law = jnp.asarray(sensor.matrix), sensor.noise
-    mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
-    noise = law.given_signal(mean, diagonal(explained))
-    second = explained + noise.covariance + outer(mean, mean)
-    slopes = matrix @ state.gaussian.root
+    y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
         prior=state.gaussian,
-        mean=mean,
-        slopes=slopes,
-        noise=noise.columns,
-        second=symmetric(second),
+        mean=y.mean,
+        slopes=jnp.asarray(sensor.matrix) @ state.gaussian.root,
+        noise=y.noise,
+        second=y.second,
         size=signal_size_at_start(sensor, start),
     )
 
