@@ -22,6 +22,7 @@ from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.data_rows import check_rows
+from heliograph.numerics.trace_settings import KEPT
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis
@@ -130,8 +131,9 @@ def scan_with_last_state(
     """
 
     # A derivative backwards keeps of each row the state before it, say 17 numbers, and computes the row again. To keep
-    # all some 540 numbers of the row takes longer, as they are stored and read.
-    @partial(jax.checkpoint, prevent_cse=False)
+    # all some 540 numbers of the row takes longer, as they are stored and read. Factors of the noises are kept, which
+    # are mostly the same in every row.
+    @partial(jax.checkpoint, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
         k, z_k, u_k = row

@@ -39,6 +39,7 @@ from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal
+from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 
@@ -112,7 +113,9 @@ def second_moments_at_start(plant: AnyPlant, start: HasStart | None = None) -> F
 def process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
     """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangularise(join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u)))))
+    joined = join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u))))
+    factors: WeightedColumns = keep_for_derivatives(triangularise(joined))
+    return factors
 
 
 def image_of(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:

@@ -26,6 +26,7 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, continue_angles, wrap_near
 from heliograph.numerics.linalg import contract, diagonal
+from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -123,7 +124,7 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
     rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
-    plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
+    plain = keep_for_derivatives(triangularise_noise(join_columns(signal.noise.through(gain), link, rounding)))
     return join_columns(plain, gain_noise(gain_spread, signal.second, signal.mean))
 
 
