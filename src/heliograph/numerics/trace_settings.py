@@ -51,7 +51,8 @@ def keep_for_derivatives(numbers: PyTree) -> PyTree:
 
     For what most models have the same in every row, which is then computed once: factors of noises.
     """
-    return jax.tree.map(lambda leaf: checkpoint_name(leaf, KEPT), numbers)
+    mark: Callable[[Any, str], Any] = checkpoint_name  # untyped in JAX
+    return jax.tree.map(lambda leaf: mark(leaf, KEPT), numbers)
 
 
 @contextmanager
