@@ -32,6 +32,19 @@ def test_it_is_the_steps_of_the_filter(item):
     assert by_rows.claim == item.claim == "exact"
 
 
+@pytest.mark.parametrize("make", [hg.kalman_filter, lambda plant, sensor: hg.linear_filter(plant, sensor, RELAY)])
+def test_rows_and_steps_begin_with_the_same_digits(make):
+    """The start of a linear filter is known: both factor it once, and compute the same from there on."""
+    start = [[2.0, 0.7], [0.7, 0.3]]
+    plant = hg.LinearPlant([[1.0, 1.0], [0.0, 0.9]], 0.1 * np.eye(2), [1.0, 0.0], start)
+    item = make(plant, SENSOR)
+    by_rows, state = item.run(Z), item.init()
+    for k, z in enumerate(Z):
+        state, estimate = item.step(state, z)
+        np.testing.assert_array_equal(by_rows.means[k], estimate.mean)
+        np.testing.assert_array_equal(by_rows.covariances[k], estimate.covariance)
+
+
 class Traced(hg.filters.AbstractFilter):
     """A filter around another, which notes each time that its correction is traced."""
 

@@ -113,21 +113,21 @@ def is_positive(x: jax.Array) -> jax.Array:
 @jax.jit
 def reciprocal_or_one(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 1 of 0: for a factor of what is 0 then."""
-    return 1 / jnp.where(is_positive(x), x, 1.0)
+    return 1 / lax.select(is_positive(x), x, lax.full_like(x, 1.0))
 
 
 @jax.jit
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
     """Return 1 / x of a positive number, and 0 of 0."""
     positive = is_positive(x)
-    return jnp.where(positive, 1 / jnp.where(positive, x, 1.0), 0.0)
+    return lax.select(positive, 1 / lax.select(positive, x, lax.full_like(x, 1.0)), lax.full_like(x, 0.0))
 
 
 @jax.jit
 def square_root(x: jax.Array) -> jax.Array:
     """Return the root of x, with the derivative 0 at 0: times the infinite one a derivative of 0 would be NaN."""
     positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    return lax.select(positive, lax.sqrt(lax.select(positive, x, lax.full_like(x, 1.0))), lax.full_like(x, 0.0))
 
 
 def triangularise(columns: WeightedColumns) -> WeightedColumns:
@@ -199,7 +199,7 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
     of zero: it is at least `least` times the variance's size.
     """
-    pivots = least * jnp.abs(diagonal(covariance))
+    pivots = least * lax.abs(diagonal(covariance))
     return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
 
 

@@ -201,7 +201,7 @@ class Innovations(NamedTuple):
         safe = jnp.where(determined, 1.0, self.variance)
         density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
         reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
-        agrees = jnp.where(jnp.abs(self.value) <= reach, 0.0, -jnp.inf)
+        agrees = jnp.where(lax.abs(self.value) <= reach, 0.0, -jnp.inf)
         return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
 
 

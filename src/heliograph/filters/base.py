@@ -239,8 +239,8 @@ class AbstractFilter(Module):
         return False
 
     @property
-    def has_known_gain(self) -> bool:
-        """True of a `LinearFilter` behind a known gain, where no noise depends on the signal: Kalman's filter."""
+    def has_score_recursion(self) -> bool:
+        """True of a `LinearFilter` of which `score_rows` knows a recursion of the derivatives."""
         return False
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":

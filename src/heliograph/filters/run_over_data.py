@@ -12,6 +12,7 @@ import numpy as np
 
 from heliograph.engine.choice import compute_once
 from heliograph.filters.chunks import ScanResult, filter_in_chunks
+from heliograph.filters.linear_recursion import initial_state_if_linear
 from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.checks.row_times import find_common_dates, read_row_dates
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -27,6 +28,7 @@ from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.linalg import find_not_finite
 from heliograph.numerics.module import readable
 from heliograph.numerics.times.data_row_checks import check_rows
+from heliograph.numerics.trace_settings import KEPT
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis
@@ -135,8 +137,9 @@ def scan_with_last_state(
     """
 
     # A derivative backwards keeps of each row the state before it, say 17 numbers, and computes the row again. To keep
-    # all some 540 numbers of the row takes longer, as they are stored and read.
-    @partial(jax.checkpoint, prevent_cse=False)
+    # all some 540 numbers of the row takes longer, as they are stored and read. Factors of the noises are kept, which
+    # are mostly the same in every row.
+    @partial(jax.checkpoint, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
         k, z_k, u_k = row
@@ -165,7 +168,9 @@ def run_over_data(filter: SteppedFilter, z: ArrayLike, u: ArrayLike | None, afte
     dates = None if dates is None or not len(dates) else dates  # a table without rows says no time
     if before is not None and dates is not None:
         _check_dates_increase(before, dates)
-    start = () if before is None else (before.state, np.asarray(begin))
+    # The rows begin behind the state of those before, or of a linear filter behind its start, which is known.
+    state = initial_state_if_linear(filter) if before is None else before.state
+    start = () if state is None else (state, np.asarray(begin))
     # Three ways, the fastest first: chunks side by side, the filter's own native code for rows, one scan. The first two
     # return None where they do not apply.
     result = filter_in_chunks(filter, rows_z, rows_u, _collect_row_results, *start)

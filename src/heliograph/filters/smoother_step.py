@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -13,12 +13,14 @@ from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, 
 from heliograph.factors.factored_gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
 from heliograph.factors.gaussian_on_group import settle, unsettle
 from heliograph.filters.plausibility import innovation_distance
-from heliograph.filters.truncation import PlacedLimits, hold_mean_within_limits, truncate_to_limits
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.manifold import Manifold
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+if TYPE_CHECKING:
+    from heliograph.filters.truncation import PlacedLimits
 
 EVERY_LINE = Manifold()
 
@@ -82,7 +84,7 @@ class SmootherStep(Module):
     received: Float[jax.Array, "*time"] | None = eqx.field(default=None, kw_only=True)
     claim: Claim = eqx.field(static=True, kw_only=True)
     manifold: Manifold = eqx.field(static=True, default=EVERY_LINE, kw_only=True)
-    limits: PlacedLimits = eqx.field(static=True, default=(), kw_only=True)
+    limits: "PlacedLimits" = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def mean(self) -> Float[Array, "*time N"]:
@@ -169,6 +171,8 @@ class SmootherStep(Module):
             mean, columns = self.projection @ mean, columns.through(self.projection)
         mean = mean if self.shift is None else mean + self.shift
         if self.limits:
+            from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
+
             law = hold_mean_within_limits(from_columns(mean, columns), self.limits)
             _, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], law), self.limits)
             return Estimate(wrap_angles(inside.mean[0], self.angles), inside.covariance[0], self.claim)

@@ -2,16 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import jax
 import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Estimate
-from heliograph.model.repeated_readings import Repeats
 from heliograph.numerics.times.dates import seconds_between
 from heliograph.numerics.types import PyTree
+
+if TYPE_CHECKING:
+    from heliograph.model.repeated_readings import Repeats
 
 Moments: TypeAlias = "float | np.datetime64 | np.ndarray"
 
@@ -42,7 +44,7 @@ class Origin:
     spacing: float = float("nan")
     estimates: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     months: int = 0
-    repeats: Mapping[str, Repeats] = field(default_factory=dict)
+    repeats: "Mapping[str, Repeats]" = field(default_factory=dict)
     several: bool = False
 
     def has_form_of(self, state: PyTree) -> bool:

@@ -10,6 +10,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
+
+from heliograph.numerics.types import PyTree
+
+KEPT = "kept"  # name of numbers that `keep_for_derivatives` marks
 
 _short: ContextVar[bool] = ContextVar("short", default=False)
 _precision: ContextVar[type[np.floating[Any]]] = ContextVar("precision", default=np.float64)
@@ -39,6 +44,15 @@ def evaluate_at_points(function: Callable[[jax.Array], jax.Array], points: jax.A
 def writes_short_programs() -> bool:
     """Return whether what is traced is written as short programs."""
     return _short.get()
+
+
+def keep_for_derivatives(numbers: PyTree) -> PyTree:
+    """Mark numbers that a derivative backwards over rows keeps, where it computes all others of a row again.
+
+    For what most models have the same in every row, which is then computed once: factors of noises.
+    """
+    mark: Callable[[Any, str], Any] = checkpoint_name  # untyped in JAX
+    return jax.tree.map(lambda leaf: mark(leaf, KEPT), numbers)
 
 
 @contextmanager

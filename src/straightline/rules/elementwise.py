@@ -232,5 +232,5 @@ RULES |= {
     "nextafter": _make_rule_of_entries(_next_after),
     "shift_right_arithmetic": _make_rule_of_entries(_shift_right_arithmetic),
 }  # fmt: skip
-PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
+PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "name")
 RULES |= dict.fromkeys(PASSED_ON, _return_arguments)

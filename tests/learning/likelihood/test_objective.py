@@ -45,6 +45,19 @@ def everywhere():
     return hg.Network(plant, {"node": hg.Node(sensor, link, {})})
 
 
+def without_noise():
+    """One combination of the start is uncertain, and a random gain is all noise that sensor and link have."""
+    plant = hg.LinearPlant(
+        jnp.array([[0.9, 0.2], [0.0, 0.7]]) * hg.free(1.0, "decay"),
+        hg.free(0.1, "q") * np.diag([1.0, 0.0]),
+        np.array([2.0, 1.0]) * hg.free(1.0, "start", "real"),
+        [[1.0, 2.0], [2.0, 4.0]],
+    )
+    sensor = hg.LinearSensor(np.eye(2), np.zeros((2, 2)))
+    link = hg.hop(hg.Rayleigh(hg.free(0.8, "scale")), 0.0, dimension=2)
+    return hg.Network(plant, {"node": hg.Node(sensor, link, {})})
+
+
 @pytest.fixture(scope="module", params=[relayed, walk, everywhere])
 def both(request):
     """An objective and data of which one number is lost."""
@@ -95,8 +108,8 @@ def test_scores_are_the_derivatives_of_the_likelihood(both):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", [walk, everywhere])
-def test_behind_a_known_gain_they_are_those_of_the_factors(network):
+@pytest.mark.parametrize("network", [walk, everywhere, relayed, without_noise])
+def test_they_are_those_of_the_factors(network):
     """To 1e-10 of the largest, a million roundings: the derivatives of factors and of covariances are two ways."""
     objective = make_objectives(describe(network))[0]
     z = np.random.default_rng(0).normal(size=(40, objective.description.start.nodes["node"].received))

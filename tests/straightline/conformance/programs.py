@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 
 from straightline import operation, present
 from tests.straightline.conformance.case import Case
@@ -110,6 +111,7 @@ CASES: dict[str, list[Case]] = {
     "copy_p": _of(jnp.copy),
     "stop_gradient": _of(lax.stop_gradient),
     "optimization_barrier": _of(lax.optimization_barrier),
+    "name": _of(lambda x: checkpoint_name(x, "kept")),
     "polynomial": _of(lambda x: jnp.polyval(jnp.array([1.0, 2.0]), x)),
     "empty": _of(lambda x: x),
     "empty2": _of(lambda x: x),

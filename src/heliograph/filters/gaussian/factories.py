@@ -6,9 +6,7 @@ from heliograph.filters.gaussian.gaussian import GaussianFilter, describe_channe
 from heliograph.filters.gaussian.gaussian_prediction import choose_initial_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, Linearization
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate, Polytope
-from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.filters.wrappers.told_link_law import accept_told_numbers
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles, mean_gain
 from heliograph.model.estimate import lower_claim_by_noise
 from heliograph.model.fading import memory_matters, without_memory

@@ -107,6 +107,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     def for_single_precision(self) -> AbstractFilter:
         """Return the filter about an origin that moves."""
+
         return make_moving_origin_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:

@@ -28,7 +28,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature, linear_image
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, gaussian_of, smoother_step_of
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.diffuse_start import UnknownStart
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.markov_jump_models import ModalPlant
@@ -39,6 +39,7 @@ from heliograph.numerics.angle import Angles, wrap_angles
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import diagonal
+from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 
@@ -112,7 +113,9 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
 def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
     """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    return triangularise(join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u)))))
+    joined = join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u))))
+    factors: WeightedColumns = keep_for_derivatives(triangularise(joined))
+    return factors
 
 
 def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:

@@ -8,8 +8,7 @@ from heliograph.filters.gaussian.recovering_gate import GivingInFilter, build_gi
 from heliograph.filters.gaussian.robust import Gate, RobustFilter, StudentVB
 from heliograph.filters.gaussian.robust_scores import AbstractWeightingRule
 from heliograph.filters.received_outlier_noise import ReceivedNoise, Vector, separate_outlier_noise
-from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.filters.wrappers.told_link_law import accept_told_numbers
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import first

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from heliograph.factors.covariance_factors import (
     WeightedColumns,
@@ -25,6 +26,7 @@ from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor, LinearSensor
 from heliograph.numerics.angle import Angles, continue_angles, wrap_near
 from heliograph.numerics.linalg import contract, diagonal
+from heliograph.numerics.trace_settings import keep_for_derivatives
 from heliograph.numerics.types import Array
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
@@ -106,7 +108,7 @@ def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.A
     moments before data grow without end where only inputs hold a plant.
     """
     law = sensor.noise
-    reach = jnp.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + jnp.abs(jnp.asarray(law.mean))
+    reach = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))
     size: jax.Array = reach**2 + diagonal(law.without_outliers().covariance)
     return size
 
@@ -123,8 +125,8 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
     """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
-    rounding = rounding_of((jnp.abs(gain) @ square_root(signal.size)) ** 2)
-    plain = triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
+    rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
+    plain = keep_for_derivatives(triangularise_noise(join_columns(signal.noise.through(gain), link, rounding)))
     return join_columns(plain, factor_gain_noise(gain_spread, signal.second, signal.mean))
 
 
@@ -158,7 +160,7 @@ def condition_on_measurement(
     value = z - expected
     after, innovations = condition_on_observation(x, slopes, value, noise, present)
     total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
-    density = innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
+    density = innovations.log_density(present, lax.abs(z) + lax.abs(expected))
     return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
 
 
@@ -173,4 +175,5 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
     """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
-    return jnp.concatenate([top, jnp.append(mean, last)[None]])
+    bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
+    return jnp.concatenate([top, bottom[None]])

@@ -8,7 +8,7 @@ from heliograph.filters.gaussian.factories import gaussian_filter
 from heliograph.filters.gaussian.gaussian import GaussianFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Function, evaluate_beside_mean
 from heliograph.filters.gaussian.uncertain_channel_updates import AbstractUpdate
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant, read_first_plant

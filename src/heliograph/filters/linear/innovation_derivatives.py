@@ -1,4 +1,4 @@
-"""Derivatives of the innovations of a linear filter behind a known gain, by the derivatives of its covariance.
+"""Derivatives of the innovations of a linear filter, by the derivatives of its covariance.
 
 Of the factors L diag(d) L' a derivative costs two passes of their orthogonal rows, with every zero of the model filled;
 of the matrix P itself it is a linear recursion that keeps these zeros and subtracts nothing large. With C = P- H',
@@ -11,7 +11,11 @@ S = H P- H' + R, K = C S^-1, w = S^-1 e and a dot for the derivative in one of t
 the last of P = P- - C S^-1 C'. A fit of four variances of thirteen states takes 84,000 operations a row by the former,
 and 14,500 by the latter.
 
-Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
+A random gain G is one more noise, (G - M) y: R holds E[(G - M) E[y y'] (G - M)'], by the state's moments before data,
+whose derivatives are carried beside, a linear recursion as well.
+
+Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974); behind a random gain the
+recursion of De Koning, Optimal estimation of linear discrete-time systems with stochastic parameters (1984).
 """
 
 from collections.abc import Callable
@@ -22,14 +26,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.gaussian.signal_moments import augmented_second_moment
 from heliograph.filters.gaussians_in_states import MomentSlopes
+from heliograph.filters.linear.linear_filter_state import LinearBelief, MomentsBeforeData
 from heliograph.model.over_time import at
-from heliograph.numerics.linalg import psd_solve, symmetric
+from heliograph.numerics.linalg import contract, psd_solve, symmetric
 from heliograph.numerics.types import Array
 
 
 class ModelMatrices(NamedTuple):
-    """A step x+ = F x + b + w, z = H x + c + v with Cov w = Q and Cov v = R, the channel's gain and noise within."""
+    """A step x+ = F x + b + w, z = H x + c + v with Cov w = Q and Cov v = R, the channel's gain and noise within.
+
+    H is by the mean gain; R holds the noise of the sensor, of the channel and of a random gain.
+    """
 
     F: jax.Array
     b: jax.Array
@@ -40,10 +49,12 @@ class ModelMatrices(NamedTuple):
 
 
 class EstimateWithDerivatives(NamedTuple):
-    """An estimate and its derivatives in each of the free numbers."""
+    """An estimate and its derivatives in each of the free numbers; behind a random gain also those before any data."""
 
     gaussian: Gaussian
     slopes: tuple[MomentSlopes, ...]
+    before_data: MomentsBeforeData | None = None
+    slopes_before_data: tuple[MomentsBeforeData, ...] | None = None
 
 
 class DifferentiatedInnovation(NamedTuple):
@@ -60,15 +71,24 @@ class DifferentiatedInnovation(NamedTuple):
     lost: jax.Array
 
 
-def differentiate_start(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
+def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool) -> EstimateWithDerivatives:
     """Return the estimate before the first step, with its derivatives in each free number.
 
     Args:
-        make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
+        make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
+        known_gain: whether the gain is known, so that no moment before data matters.
     """
-    starts = [jax.jvp(lambda x: _find_initial_moments(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x))]
-    return EstimateWithDerivatives(jax.tree.map(jnp.asarray, make(x).init().gaussian), tuple(starts))
+    slopes = tuple(jax.jvp(lambda x: _find_initial_moments(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x)))
+    start = jax.tree.map(jnp.asarray, make(x).init())
+    if known_gain:
+        return EstimateWithDerivatives(start.gaussian, slopes)
+    return EstimateWithDerivatives(
+        gaussian=start.gaussian,
+        slopes=slopes,
+        before_data=MomentsBeforeData(start.state_mean, start.state_covariance),
+        slopes_before_data=tuple(MomentsBeforeData(*slope) for slope in slopes),
+    )
 
 
 def differentiate_step(
@@ -77,7 +97,7 @@ def differentiate_step(
     """Return estimate and innovation of a row (z, u), both with their derivatives in each free number.
 
     Args:
-        make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
+        make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
         before: the estimate before the row.
         row: measurement (m,), NaN for what did not arrive, and input.
@@ -85,38 +105,49 @@ def differentiate_step(
     """
     z, u = row
     filter, present = make(x), ~jnp.isnan(z)
-    # For each free number the step's matrices, which are the same, and their derivatives.
-    pairs = [jax.jvp(lambda x: find_model_matrices(make(x), u, k), (x,), (axis,)) for axis in np.eye(len(x))]
+    # For each free number the step's matrices and the moments before data, which are the same, and their derivatives.
+    pairs = [
+        jax.jvp(lambda x, moments: find_model_matrices(make(x), moments, u, k), (x, before.before_data), (axis, slope))
+        for axis, slope in zip(np.eye(len(x)), before.slopes_before_data or [None] * len(x), strict=True)
+    ]
+    (matrices, moments), _ = pairs[0]
     # Behind a known gain no moment before data matters: those at the start stand for all.
-    prior = filter.predict(filter.init()._replace(gaussian=before.gaussian), u, k)
+    start = filter.init() if before.before_data is None else LinearBelief(before.gaussian, *before.before_data)
+    prior = filter.predict(start._replace(gaussian=before.gaussian), u, k)
     after, innovation = filter.correct(prior, z, k)
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     step = FilterStep(
-        matrices=pairs[0][0], before=before.gaussian, prior=prior.gaussian, e=value, S=covariance, present=present
+        matrices=matrices, before=before.gaussian, prior=prior.gaussian, e=value, S=covariance, present=present
     )
     slopes_after, slopes_of_e, slopes_of_S = zip(
-        *(step.differentiate_in_one_number(d, one) for (_, d), one in zip(pairs, before.slopes, strict=True)),
+        *(step.differentiate_in_one_number(d, one) for (_, (d, _)), one in zip(pairs, before.slopes, strict=True)),
         strict=True,
     )
     lost = jnp.any(jnp.isnan(after.gaussian.mean))
     innovation_with_slopes = DifferentiatedInnovation(
         e=value, S=covariance, de=jnp.stack(slopes_of_e), ds=jnp.stack(slopes_of_S), present=present, lost=lost
     )
-    return EstimateWithDerivatives(after.gaussian, slopes_after), innovation_with_slopes
+    slopes_before_data = None if moments is None else tuple(slope for _, (_, slope) in pairs)
+    return EstimateWithDerivatives(after.gaussian, slopes_after, moments, slopes_before_data), innovation_with_slopes
 
 
-def find_model_matrices(filter: Any, u: Array, k: Array) -> ModelMatrices:
-    """Return F, b, Q, H, c and R of step k of a linear filter, under the input u."""
+def find_model_matrices(
+    filter: Any, moments: MomentsBeforeData | None, u: Array, k: Array
+) -> tuple[ModelMatrices, MomentsBeforeData | None]:
+    """Return F, b, Q, H, c and R of step k of a linear filter, under the input u, and the moments before data after it.
+
+    `moments`: those before data of the state before the step; None behind a known gain, where none are returned.
+    """
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
-    return ModelMatrices(
-        F=plant.transition_matrix(u),
-        b=plant.shift(u),
-        Q=plant.noise_covariance(u),
-        H=gain @ jnp.asarray(sensor.matrix),
-        c=gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset),
-        R=gain @ jnp.asarray(law.covariance) @ gain.T + channel.noise.covariance,
-    )
+    F, b, Q = plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
+    R = gain @ jnp.asarray(law.covariance) @ gain.T + channel.noise.covariance
+    if moments is not None:
+        moments = moments.predict(F, b, Q)
+        y = moments.measure(sensor)
+        R = R + contract(channel.gain_spread, augmented_second_moment(y.second, y.mean, 1.0))
+    H, c = gain @ jnp.asarray(sensor.matrix), gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset)
+    return ModelMatrices(F=F, b=b, Q=Q, H=H, c=c, R=R), moments
 
 
 def _find_initial_moments(filter: Any) -> MomentSlopes:

@@ -1,6 +1,7 @@
-"""Log-likelihood, scores and information of recordings under a linear filter behind a known gain."""
+"""Log-likelihood, scores and information of recordings under a linear filter."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -29,15 +30,17 @@ class ScoreRecursion(Recursion):
     Where it is `informed` also information (2, p, p), by halves of the recording.
 
     Args:
-        make: the filter by the free numbers, a `LinearFilter` with `has_known_gain`.
+        make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
         half: number of the first row of the second half.
+        known_gain: whether the channel's gain is known.
         informed: whether there is information.
     """
 
     make: Callable[[Array], Any] = eqx.field(static=True)
     x: Array
     half: Array
+    known_gain: bool = eqx.field(static=True)
     informed: bool = eqx.field(static=True)
 
     def step(
@@ -64,7 +67,7 @@ class ScoreRecursion(Recursion):
             after, (density, score, halves) = self.step(now[0], (z, u), k)
             return (after, now[1] + halves), (density, score)
 
-        start: Now = (_start_at(self.make, self.x), jnp.zeros((2, len(self.x), len(self.x))))
+        start: Now = (differentiate_start(self.make, self.x, self.known_gain), jnp.zeros((2, len(self.x), len(self.x))))
         (_, halves), (density, score) = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
         return density, score, halves
 
@@ -81,18 +84,18 @@ class ScoreRecursion(Recursion):
         sums = self.sum_long(z, u)
         if sums is None:
             return None
-        rows = scan_in_chunks(ScoreRecursion(self.make, self.x, self.half, informed=False), self._start(), (z, u))
+        rows = scan_in_chunks(replace(self, informed=False), self._start(), (z, u))
         return None if rows is None else (*rows.outputs, sums[2])
 
     def _start(self) -> EstimateWithDerivatives:
         """Return the estimate before the first row with its derivatives, computed in double precision by XLA."""
-        start: EstimateWithDerivatives = compute_once(_start_at, _start_by_xla, (self.make, self.x))
+        start: EstimateWithDerivatives = compute_once(_start_of, _start_by_xla, (self,))
         return start
 
 
-def _start_at(make: Callable[[Array], Any], x: Array) -> EstimateWithDerivatives:
-    """Return the estimate before the first row of the filter of free numbers x: compiled body of `_start`."""
-    return differentiate_start(make, x)
+def _start_of(recursion: ScoreRecursion) -> EstimateWithDerivatives:
+    """Return the estimate before the first row with its derivatives: compiled body of `ScoreRecursion._start`."""
+    return differentiate_start(recursion.make, recursion.x, recursion.known_gain)
 
 
-_start_by_xla = quickly_compiled(_start_at)
+_start_by_xla = quickly_compiled(_start_of)

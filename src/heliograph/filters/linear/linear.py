@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -18,14 +19,16 @@ from heliograph.filters.gaussian.gaussian import correct_signal, describe_channe
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
 from heliograph.filters.gaussian.signal_moments import Signal, bound_signal_power_at_start
 from heliograph.filters.gaussian.uncertain_channel_updates import Polytope
-from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
-from heliograph.filters.linear.likelihood_scores import ScoreRecursion
-from heliograph.filters.linear.linear_filter_state import LinearBelief, motion_of_plant, predict_belief, prior_belief
+from heliograph.filters.linear.linear_filter_state import (
+    LinearBelief,
+    MomentsBeforeData,
+    motion_of_plant,
+    predict_belief,
+    prior_belief,
+)
 from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.filters.wrappers.told_link_law import accept_told_numbers
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
@@ -34,16 +37,18 @@ from heliograph.model.over_time import OverTime, at, first, stack_over_time
 from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes, with_premise
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import diagonal, symmetric
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import check_maps
 from heliograph.random_affine.memories_of_channels import is_memory_dependent
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
 from heliograph.random_affine.outlier_noise import has_bounded_noise
 from heliograph.random_affine.words.rounding_noise import find_rounded_noises
+
+if TYPE_CHECKING:  # what few calls need is loaded by them
+    from heliograph.filters.linear.likelihood_scores import ScoreRecursion
+    from heliograph.model.words.encoder import Words
 
 
 class LinearFilter(AbstractSizedFilter):
@@ -111,22 +116,26 @@ class LinearFilter(AbstractSizedFilter):
         return True
 
     @property
-    def has_known_gain(self) -> bool:
-        """Whether the channel's gain is known and no noise depends on the signal: then it is Kalman's filter."""
-        whole = stack_over_time(self.channel)
-        return not (whole.uncertain or np.any(np.asarray(whole.gain_spread)) or find_rounded_noises(self.sensor))
+    def has_score_recursion(self) -> bool:
+        """Whether the channel's law is known and no noise depends on the signal but by a random gain."""
+        return not (stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor))
 
-    def score_rows(self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array) -> ScoreRecursion:
+    def score_rows(
+        self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
+    ) -> "ScoreRecursion":
         """Return the log-likelihood of rows, its derivatives and information, of a filter like this with free numbers.
 
         Args:
-            make: the filter by the free numbers, one that `has_known_gain`.
+            make: the filter by the free numbers, one that `has_score_recursion`.
             x: the free numbers.
             half: number of the first row of the second half of the recording, of which information is summed apart.
 
         Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
         """
-        return ScoreRecursion(make, x, half, informed=True)
+        from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
+
+        known_gain = not np.any(np.asarray(stack_over_time(self.channel).gain_spread))
+        return ScoreRecursion(make, x, half, known_gain, informed=True)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """Precompute all covariances and gains."""
@@ -136,6 +145,8 @@ class LinearFilter(AbstractSizedFilter):
         """Return the same filter with covariances given its data where gains are random: else they are its own."""
         if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
             return self
+        from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
+
         return LinearFilterOfRecord(filter=self, plant=self.plant, **make_sizes("nominal", self, self.received))
 
 
@@ -145,17 +156,13 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
     They depend on the error covariance and the state's moments before data alone, not on the estimate, so that
     derivatives by the estimate do not involve them.
     """
-    matrix, law = jnp.asarray(sensor.matrix), sensor.noise
-    mean, explained = matrix @ state.state_mean + law.mean, matrix @ state.state_covariance @ matrix.T
-    noise = law.given_signal(mean, diagonal(explained))
-    second = explained + noise.covariance + jnp.outer(mean, mean)
-    slopes = matrix @ state.gaussian.root
+    y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
         prior=state.gaussian,
-        mean=mean,
-        slopes=slopes,
-        noise=noise.columns,
-        second=symmetric(second),
+        mean=y.mean,
+        slopes=jnp.asarray(sensor.matrix) @ state.gaussian.root,
+        noise=y.noise,
+        second=y.second,
         size=bound_signal_power_at_start(sensor, start),
     )
 
@@ -182,7 +189,7 @@ def linear_filter(
     sensor: AnySensor,
     channel: Channel,
     update: Polytope | None = None,
-    encoder: Words | None = None,
+    encoder: "Words | None" = None,
 ) -> AbstractFilter:
     """Return the best linear filter for a linear plant and sensor behind any channel.
 

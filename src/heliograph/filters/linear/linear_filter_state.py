@@ -10,7 +10,8 @@ from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, predict_affine
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.model.plant import AbstractPlant, LinearPlant
-from heliograph.numerics.linalg import symmetric
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.linalg import diagonal, outer, symmetric
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Float
 
@@ -50,6 +51,14 @@ class LinearBelief(NamedTuple):
     state_covariance: Float[jax.Array, "n n"]
 
 
+class SignalMoments(NamedTuple):
+    """Mean E y (p,) and second moment E[y y'] (p, p) of a signal before any data, and its noise v (p, columns)."""
+
+    mean: jax.Array
+    second: jax.Array
+    noise: WeightedColumns
+
+
 def prior_belief(start: AbstractPlant) -> LinearBelief:
     """Return the prior, both as estimate and as the state's moments before data."""
     xp = library(start.initial_mean, start.initial_covariance)
@@ -60,9 +69,28 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
     gaussian = predict_affine(belief.gaussian, step.matrix, step.shift, step.noise)
-    mean = step.matrix @ belief.state_mean + step.shift
-    covariance = step.matrix @ belief.state_covariance @ step.matrix.T + step.covariance
-    return LinearBelief(gaussian, *_limit_to_finite_squares(mean, symmetric(covariance)))
+    before_data = MomentsBeforeData(belief.state_mean, belief.state_covariance)
+    return LinearBelief(gaussian, *before_data.predict(step.matrix, step.shift, step.covariance))
+
+
+class MomentsBeforeData(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the plant's state before any data."""
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+
+    def predict(self, matrix: jax.Array, shift: jax.Array, noise: jax.Array) -> "MomentsBeforeData":
+        """Return them after a step x+ = A x + b + w: A m + b and A P A' + Q."""
+        covariance = matrix @ self.covariance @ matrix.T + noise
+        return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + shift, symmetric(covariance)))
+
+    def measure(self, sensor: LinearSensor) -> SignalMoments:
+        """Return the moments of the signal y = C x + v."""
+        matrix, law = jnp.asarray(sensor.matrix), sensor.noise
+        mean, explained = matrix @ self.mean + law.mean, matrix @ self.covariance @ matrix.T
+        noise = law.given_signal(mean, diagonal(explained))
+        second = symmetric(explained + noise.covariance + outer(mean, mean))
+        return SignalMoments(mean=mean, second=second, noise=noise.columns)
 
 
 def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -34,8 +34,7 @@ from heliograph.filters.base import (
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, second_moments_at_start
 from heliograph.filters.innovation import mixed_innovation, posterior_weights
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
-from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.filters.wrappers.told_link_law import accept_told_numbers
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_told_numbers
 from heliograph.model.channel import Channel, check_link, find_received_angles
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, list_models_by_step, steps_covered, vary_over_steps

@@ -54,9 +54,7 @@ from heliograph.filters.modes.mixing import (
 from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.wrappers.sensor_inputs import accept_sensor_inputs
-from heliograph.filters.wrappers.state_limits import accept_limits
-from heliograph.filters.wrappers.told_link_law import accept_told_numbers
+from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import ModalPlant, list_mode_models, transition_over

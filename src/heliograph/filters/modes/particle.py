@@ -38,7 +38,7 @@ from heliograph.filters.particles.resampling import (
     resample_systematically,
 )
 from heliograph.filters.particles.state_particles import MANY, StateParticleFilter, build_state_particles
-from heliograph.filters.wrappers.state_limits import accept_limits
+from heliograph.filters.wrappers.accepted_models import accept_limits
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor

@@ -1,9 +1,7 @@
 """Filters of sensors that depend on inputs: at each step the filter of the sensor that the inputs give."""
 
-import inspect
 from collections.abc import Callable
-from functools import wraps
-from typing import NamedTuple, ParamSpec, TypeVar, cast
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,7 +22,7 @@ from heliograph.model.estimate import Innovation
 from heliograph.model.over_time import at, at_each_step, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.premises.premise import with_premise
-from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, PyTree
@@ -94,37 +92,7 @@ class FilterOfInputs(AbstractWrapper):
         return filter
 
 
-def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
-
-    Args:
-        make: a function of a plant, a sensor, mostly a channel, and more.
-    """
-    parameters = inspect.signature(make)
-
-    @wraps(make)
-    def build_with_inputs(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
-        given = parameters.bind(*args, **kwargs).arguments
-        sensor = first(given.get("sensor"))
-        # What is no sensor has no inputs, and is for `make` to refuse.
-        depends_on_inputs = isinstance(sensor, AbstractSensor) and bool(sensor.inputs)
-        if not depends_on_inputs:
-            return make(*args, **kwargs)
-        plant, sensor = given.pop("plant"), given.pop("sensor")
-
-        make_any: Callable[..., AbstractFilter] = make  # called by names of its parameters, two of which are taken out
-
-        def make_for(typical: AnySensor) -> AbstractFilter:
-            """Make the filter of this sensor and of all other arguments."""
-            return make_any(plant=plant, sensor=typical, **given)
-
-        return cast(F, _build_filter_of_inputs(plant, sensor, given.get("channel"), make_for))
-
-    return build_with_inputs
-
-
-def _build_filter_of_inputs(
+def build_filter_of_inputs(
     plant: AnyPlant, sensor: AnySensor, channel: Channel | None, make: Callable[[AnySensor], AbstractFilter]
 ) -> FilterOfInputs:
     """Build the filter of a plant, of a sensor that depends on its inputs, and of a channel.

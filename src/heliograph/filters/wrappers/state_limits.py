@@ -7,12 +7,9 @@ state that hardly moves would be pushed away from them, and ever surer of it.) W
 before lay within them too. Where a mean leaves the limits, the filter goes on from the most likely point within.
 """
 
-import inspect
-from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from functools import wraps
-from typing import Any, ClassVar, ParamSpec, TypeVar, cast
+from typing import ClassVar, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -218,29 +215,7 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
     return unlimited
 
 
-def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take plants whose states have limits, by a `LimitedFilter` of what it makes.
-
-    Args:
-        make: a function of a plant and more, whose filter keeps Gaussians or particles.
-    """
-    parameters = inspect.signature(make)
-
-    @wraps(make)
-    def build_limited(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter of a plant without limits, and put limits around it where the plant has some."""
-        given = parameters.bind(*args, **kwargs)
-        plant = given.arguments.get("plant")
-        start = first(plant)
-        if not isinstance(start, AbstractPlant) or not start.limits:
-            return make(*args, **kwargs)
-        given.arguments["plant"] = without_limits(cast(Any, plant))
-        return cast(F, _make_limited_filter(make(*given.args, **given.kwargs), cast(Any, plant)))
-
-    return build_limited
-
-
-def _make_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
+def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
     """Return the filter of the plant with limits, from that of the plant without."""
     start = first(plant)
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)

@@ -3,10 +3,8 @@
 Told numbers come with a message and say what the link did to it, such as its gain; a law is that of gain and noise.
 """
 
-import inspect
 from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -34,7 +32,6 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.module import Module
 from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import ArrayLike, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
     condition_on_told_numbers,
     list_told_maps,
@@ -248,31 +245,3 @@ def believe_typical(link: PyTree) -> PyTree:
     """Return a link as it is for typical numbers."""
     typical = [affine.typical for affine in list_told_maps(link)]
     return condition_on_told_numbers(link, library(typical).concatenate(typical))
-
-
-def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take channels that report numbers of their law with each message.
-
-    Behind such a channel the function then makes a `ToldFilter`, which reads the numbers (they are told) and corrects
-    with a filter of the law that they give. To a type checker the function returns what it returned before: behind any
-    other channel it does.
-
-    Args:
-        make: a function of a plant, a sensor, a channel, and more.
-    """
-    parameters = inspect.signature(make)
-
-    @wraps(make)
-    def build_with_told_numbers(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
-        given = parameters.bind(*args, **kwargs).arguments
-        channel = given.get("channel")
-        # What is no channel reports nothing, and is for `make` to refuse.
-        is_channel = isinstance(first(channel), AbstractRandomAffine)
-        reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
-        if not reports_numbers:
-            return make(*args, **kwargs)
-        plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
-        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
-
-    return build_with_told_numbers

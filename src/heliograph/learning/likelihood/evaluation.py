@@ -83,10 +83,12 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
 
     It cannot where recordings are short, true states are learned from, or the filter's gains are random.
     """
-    kalman = _find_kalman_filter(objective) if data.truth is None else None
-    if kalman is None:
+    linear = _find_linear_filter(objective) if data.truth is None else None
+    if linear is None:
         return None
-    recursion = kalman.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
+    recursion = linear.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
+    if not recursion.known_gain:
+        return None
     by_recording = []
     for z, u in zip(data.measurements, data.inputs, strict=True):
         evaluated = recursion.scan_long(z, u) if by_row else recursion.sum_long(z, u)
@@ -140,10 +142,10 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
         `Evaluation` of shapes: density (steps,), score (steps, p), halves (2, p, p).
     """
     half = jnp.asarray(len(z) // 2)
-    # A linear filter with known gains has a recursion of its own for these derivatives.
-    kalman = _find_kalman_filter(objective) if truth is None else None
-    if kalman is not None:
-        density, score, halves = kalman.score_rows(objective.filter, x, half).scan(z, u)
+    # A linear filter has a recursion of its own for these derivatives.
+    linear = _find_linear_filter(objective) if truth is None else None
+    if linear is not None:
+        density, score, halves = linear.score_rows(objective.filter, x, half).scan(z, u)
         return Evaluation(density=density, score=score, halves=halves)
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
@@ -181,10 +183,10 @@ def _differentiate_errors(
 
 
 @lru_cache
-def _find_kalman_filter(objective: Objective) -> Any:
-    """Return the filter at the objective's start if it is linear with known gains (it has `score_rows`); else None."""
+def _find_linear_filter(objective: Objective) -> Any:
+    """Return the filter at the objective's start if it is linear and has `score_rows`; else None."""
     start = make_filter_of_form(objective.description.start, objective.form)
-    return start if start.has_known_gain else None
+    return start if start.has_score_recursion else None
 
 
 _by_xla = quickly_compiled(evaluate_recording)

@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from copy import copy
 from functools import wraps
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
@@ -12,13 +12,15 @@ from heliograph.model.channel import Channel, perfect
 from heliograph.model.diffuse_start import TAKEN_BY, UnknownStart
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.reading_limits import ReadingLimits
-from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
-from heliograph.model.trigger import AbstractTrigger
-from heliograph.model.words.encoder import Words
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import readable
+
+if TYPE_CHECKING:  # what few filters believe is loaded where it is made
+    from heliograph.model.reading_limits import ReadingLimits
+    from heliograph.model.relays import RelayNetwork
+    from heliograph.model.trigger import AbstractTrigger
+    from heliograph.model.words.encoder import Words
 
 WITHOUT_ATTITUDE = "no attitude (hg.extended_filter, unscented_filter and cubature_filter know them)"
 RATES_TAKEN_BY = "transitions of its modes by steps here (imm_filter, gpb1_filter and gpb2_filter take rates)"
@@ -50,12 +52,12 @@ class Premise:
         plant: AnyPlant,
         sensor: AnySensor | None = None,
         channel: Channel | None = None,
-        trigger: AbstractTrigger | None = None,
+        trigger: "AbstractTrigger | None" = None,
         order: int | None = MEAN_AND_COVARIANCE,
-        relays: RelayNetwork | None = None,
+        relays: "RelayNetwork | None" = None,
         gains: Mapping[str, np.ndarray] | None = None,
-        range: ReadingLimits | None = None,
-        encoder: Words | None = None,
+        range: "ReadingLimits | None" = None,
+        encoder: "Words | None" = None,
     ):
         self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
         self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range

@@ -1,0 +1,106 @@
+"""Models that a wrapper reads, accepted by the functions that make filters: limits, sensors of inputs, told numbers.
+
+A decorator for each: where a model has what the wrapper is for, the function makes the wrapper of what it makes. The
+wrappers are loaded when the first of them is made.
+"""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, cast
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.channel_side_information import separate_told_numbers
+from heliograph.model.over_time import first
+from heliograph.model.plant import AbstractPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.random_affine.base import AbstractRandomAffine
+
+F = TypeVar("F", bound=AbstractFilter)
+P = ParamSpec("P")
+
+
+def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take plants whose states have limits, by a `LimitedFilter` of what it makes.
+
+    Args:
+        make: a function of a plant and more, whose filter keeps Gaussians or particles.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build_limited(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter of a plant without limits, and put limits around it where the plant has some."""
+        given = parameters.bind(*args, **kwargs)
+        plant = given.arguments.get("plant")
+        start = first(plant)
+        if not isinstance(start, AbstractPlant) or not start.limits:
+            return make(*args, **kwargs)
+        from heliograph.filters.wrappers.state_limits import build_limited_filter, without_limits
+
+        given.arguments["plant"] = without_limits(cast(Any, plant))
+        return cast(F, build_limited_filter(make(*given.args, **given.kwargs), cast(Any, plant)))
+
+    return build_limited
+
+
+def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
+
+    Args:
+        make: a function of a plant, a sensor, mostly a channel, and more.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build_with_inputs(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
+        given = parameters.bind(*args, **kwargs).arguments
+        sensor = first(given.get("sensor"))
+        # What is no sensor has no inputs, and is for `make` to refuse.
+        depends_on_inputs = isinstance(sensor, AbstractSensor) and bool(sensor.inputs)
+        if not depends_on_inputs:
+            return make(*args, **kwargs)
+        from heliograph.filters.wrappers.sensor_inputs import build_filter_of_inputs
+
+        plant, sensor = given.pop("plant"), given.pop("sensor")
+
+        make_any: Callable[..., AbstractFilter] = make  # called by names of its parameters, two of which are taken out
+
+        def make_for(typical: AnySensor) -> AbstractFilter:
+            """Make the filter of this sensor and of all other arguments."""
+            return make_any(plant=plant, sensor=typical, **given)
+
+        return cast(F, build_filter_of_inputs(plant, sensor, given.get("channel"), make_for))
+
+    return build_with_inputs
+
+
+def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
+    """Let a function that makes a filter take channels that report numbers of their law with each message.
+
+    Behind such a channel the function then makes a `ToldFilter`, which reads the numbers (they are told) and corrects
+    with a filter of the law that they give. To a type checker the function returns what it returned before: behind any
+    other channel it does.
+
+    Args:
+        make: a function of a plant, a sensor, a channel, and more.
+    """
+    parameters = inspect.signature(make)
+
+    @wraps(make)
+    def build_with_told_numbers(*args: P.args, **kwargs: P.kwargs) -> F:
+        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
+        given = parameters.bind(*args, **kwargs).arguments
+        channel = given.get("channel")
+        # What is no channel reports nothing, and is for `make` to refuse.
+        is_channel = isinstance(first(channel), AbstractRandomAffine)
+        reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
+        if not reports_numbers:
+            return make(*args, **kwargs)
+        from heliograph.filters.wrappers.told_link_law import FilterMaker, build_told_filter
+
+        plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
+        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
+
+    return build_with_told_numbers
