@@ -1,9 +1,9 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
+from straightline import compile
 
 DRAWS = 2000
 LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard deviations each: 9 sigma of the widest
@@ -11,12 +11,13 @@ LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard devi
 
 def received(channel, y, seed=0):
     with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(seed), DRAWS)
-        h = jax.jit(jax.vmap(channel.sample))(keys)
-        z = h[:, :-1, :-1] @ jnp.asarray(y) + h[:, :-1, -1]
+        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(seed), DRAWS)))
+        # Native code, which draws as XLA does and is compiled in a tenth of its time.
+        h = compile(lambda key: channel.sample(jax.random.wrap_key_data(key)), keys[0])(keys)
+    z = h[:, :-1, :-1] @ np.array(y) + h[:, :-1, -1]
     bottom = np.eye(1, channel.inputs + 1, channel.inputs)
     assert np.array_equal(h[:, -1:], np.broadcast_to(bottom, (DRAWS, 1, channel.inputs + 1)))
-    return np.asarray(z)
+    return z
 
 
 def test_all_components_are_lost_together_and_the_rest_is_the_channel():
