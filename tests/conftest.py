@@ -146,6 +146,15 @@ def pytest_runtest_protocol(item, nextitem):
     return reserve_stack(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
 
 
+@pytest.fixture
+def collect_garbage():
+    """Called, collects what the test let go: objects from before are not looked at, which takes seconds."""
+    gc.collect(1)
+    gc.disable()  # nothing of the test counts as old
+    yield lambda: gc.collect(1)
+    gc.enable()
+
+
 @pytest.fixture(scope="session")
 def memory_left():
     """Of this process after it let go, in bytes: a list, to which is added each time."""
