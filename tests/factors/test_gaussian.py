@@ -47,7 +47,7 @@ def log_density(seen, present, size):
 
 
 EXACT = {"rtol": 1e-11, "atol": 1e-12}  # some twenty products of numbers of order 1, and a solution
-SIZES = [(1, 1), (3, 2), (5, 3), (18, 4)]
+SIZES = [(1, 1), (3, 2), (5, 3), (9, 4)]  # all written out, which 24 rows are
 
 
 @pytest.fixture(autouse=True)
@@ -218,7 +218,7 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same():
     np.testing.assert_allclose(np.transpose(found), np.array(gain, dtype=float), rtol=1e-10)
 
 
-@pytest.mark.parametrize(("n", "state_noise"), [(4, 0.0), (4, 1.0), (18, 1.0)])
+@pytest.mark.parametrize(("n", "state_noise"), [(4, 0.0), (4, 1.0), (9, 1.0)])
 def test_smoothing_is_rauch_s(n, state_noise):
     """Of x given x+ known better: m + J (m_s - m+), P + J (P_s - P+) J' with J = P F' (P+)^-1."""
     mean, p, _, _, _ = problem(n, 1)
@@ -235,7 +235,7 @@ def test_smoothing_is_rauch_s(n, state_noise):
     np.testing.assert_allclose(known.covariance, p + gain @ (0.4 * prior - prior) @ gain.T, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [3, 18])
+@pytest.mark.parametrize("n", [3, 9])
 def test_a_part_that_others_determine_says_nothing_of_the_state_before(n):
     """The last part of x+ is the sum of the first two, to rounding: its innovation is that, and its gain is zero."""
     mean, p, _, _, _ = problem(n, 1)
