@@ -1,19 +1,15 @@
-import jax
 import numpy as np
 import pytest
 
 import heliograph as hg
-from straightline import compile
+from tests.draws import draw
 
 DRAWS = 2000
 LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard deviations each: 9 sigma of the widest
 
 
 def received(channel, y, seed=0):
-    with jax.enable_x64(True):
-        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(seed), DRAWS)))
-        # Native code, which draws as XLA does and is compiled in a tenth of its time.
-        h = compile(lambda key: channel.sample(jax.random.wrap_key_data(key)), keys[0])(keys)
+    h = draw(channel.sample, DRAWS, seed)
     z = h[:, :-1, :-1] @ np.array(y) + h[:, :-1, -1]
     bottom = np.eye(1, channel.inputs + 1, channel.inputs)
     assert np.array_equal(h[:, -1:], np.broadcast_to(bottom, (DRAWS, 1, channel.inputs + 1)))
