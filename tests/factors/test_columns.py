@@ -41,9 +41,9 @@ def product(c):
     return (c.matrix * c.weights) @ np.transpose(c.matrix)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 16, 17, 20])
+@pytest.mark.parametrize("n", [1, 2, 5, 9, 25])
 def test_both_ways_to_factors_give_the_sum(n):
-    """Written out up to 16 rows, a loop above."""
+    """Written out up to 24 rows, a loop above."""
     given = columns(n, n + 3)
     for factors in (triangularise(given), eliminate(given.covariance)):
         np.testing.assert_allclose(product(factors), product(given), **EXACT)
@@ -51,7 +51,7 @@ def test_both_ways_to_factors_give_the_sum(n):
         assert np.all(np.asarray(factors.weights) > 0)
 
 
-@pytest.mark.parametrize("n", [4, 18])
+@pytest.mark.parametrize("n", [4, 25])
 def test_a_row_made_of_others_leaves_nothing(n):
     """Exactly nothing of a row of zeros; of twice another the square of rounding, or, eliminated, rounding."""
     given = columns(n, n + 3)
