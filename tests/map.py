@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from heliograph.numerics import pause_collector
+
 SOURCE = Path(__file__).parents[1] / "src" / "heliograph"
 # Parts of the library, from the description of a world to the programs that people run, and what each is for.
 PARTS = {
@@ -66,8 +68,9 @@ BEGIN, END = "<!-- made by python -m tests.map -->", "<!-- end -->"
 
 
 @cache
+@pause_collector()
 def parsed(path: Path) -> ast.Module:
-    """A file, read once for all tests of a process."""
+    """A file, read once for all tests of a process; a tree holds no garbage."""
     return ast.parse(path.read_text())
 
 
