@@ -53,7 +53,7 @@ def pytest_configure(config):
 
 def understood(flags: str) -> bool:
     """Whether this release of the compiler knows these flags: one that does not ends the process that asks."""
-    requested = [sys.executable, "-c", "import jax; jax.devices()"]
+    requested = [sys.executable, "-c", "from jaxlib import xla_client; xla_client.make_cpu_client()"]
     return subprocess.run(requested, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True).returncode == 0
 
 
@@ -144,6 +144,15 @@ def pytest_runtest_protocol(item, nextitem):
     from heliograph.numerics import reserve_stack
 
     return reserve_stack(item.config.pluginmanager.getplugin("runner").pytest_runtest_protocol)(item, nextitem)
+
+
+@pytest.fixture
+def collect_garbage():
+    """Called, collects what the test let go: objects from before are not looked at, which takes seconds."""
+    gc.collect(1)
+    gc.disable()  # nothing of the test counts as old
+    yield lambda: gc.collect(1)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,11 @@ folder that is no public room is listed in its `__init__.pyi`, written by the sa
 import ast
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+
+from heliograph.numerics import pause_collector
 
 SOURCE = Path(__file__).parents[1] / "src" / "heliograph"
 # Parts of the library, from the description of a world to the programs that people run, and what each is for.
@@ -65,9 +68,19 @@ BEGIN, END = "<!-- made by python -m tests.map -->", "<!-- end -->"
 
 
 @cache
+@pause_collector()
 def parsed(path: Path) -> ast.Module:
-    """A file, read once for all tests of a process."""
+    """A file, read once for all tests of a process; a tree holds no garbage."""
     return ast.parse(path.read_text())
+
+
+def statements(tree: ast.AST) -> Iterator[ast.stmt]:
+    """All statements of a file or a part of it, whatever they stand in: one of ten nodes is one."""
+    for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for node in getattr(tree, field, ()):
+            if isinstance(node, ast.stmt):
+                yield node
+            yield from statements(node)
 
 
 @cache
@@ -76,7 +89,7 @@ def names_taken_by(path: Path) -> list[tuple[str, str]]:
 
     The latter is `import heliograph.filters.modes as modes`, and somewhere `modes.modal_filter`.
     """
-    nodes = list(ast.walk(parsed(path)))
+    nodes = list(statements(parsed(path)))
     imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     asked = {
         alias.asname: alias.name
@@ -85,8 +98,12 @@ def names_taken_by(path: Path) -> list[tuple[str, str]]:
         for alias in node.names
         if alias.asname and alias.name.startswith("heliograph.")
     }
-    attributes = [node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
-    named = {(asked[node.value.id], node.attr) for node in attributes if node.value.id in asked}
+    attributes = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Attribute)] if asked else []
+    named = {
+        (asked[node.value.id], node.attr)
+        for node in attributes
+        if isinstance(node.value, ast.Name) and node.value.id in asked
+    }
     return [(node.module, alias.name) for node in imports for alias in node.names] + [
         (home_of(folder, name), name) for folder, name in sorted(named)
     ]

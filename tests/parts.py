@@ -5,6 +5,7 @@ command that installs it.
 """
 
 import sys
+import sysconfig
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,15 +30,9 @@ class Part(NamedTuple):
 
 
 def broker(client: str) -> bool:
-    """Whether there is a server of both protocols, and a client of one."""
-    if find_spec(client) is None:
-        return False
-    from heliograph_studies.live.server import find_server
-
-    try:
-        return bool(find_server())
-    except ModuleNotFoundError:
-        return False
+    """Whether there is a server of both protocols, in the environment or on the machine, and a client of one."""
+    server = which("nats-server", path=sysconfig.get_path("scripts")) or which("nats-server")
+    return server is not None and find_spec(client) is not None
 
 
 LIVE = f"{Path(sys.executable).name} -m pip install '{ROOT}[live]'"

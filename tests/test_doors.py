@@ -8,7 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.map import BORDERS, ROOMS, SOURCE, at_borders, border_of, crossing, imports_line, map_of_rooms, parsed
+from tests.map import (
+    BORDERS,
+    ROOMS,
+    SOURCE,
+    at_borders,
+    border_of,
+    crossing,
+    imports_line,
+    map_of_rooms,
+    parsed,
+    statements,
+)
 from tests.test_structure import PUBLIC
 
 ALL = [room for rooms in ROOMS.values() for room in rooms]
@@ -76,7 +87,7 @@ def test_tests_take_few_names_from_inside():
     public, border = {name for _, name in PUBLIC}, at_borders()
     names = set()
     for path in Path(__file__).parent.rglob("*.py"):
-        for node in ast.walk(parsed(path)):
+        for node in statements(parsed(path)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("heliograph."):
                 taken = {f"{node.module}.{alias.name}" for alias in node.names if alias.name not in public}
                 names |= taken - border

@@ -9,10 +9,8 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
 
-import pytest
-
 import heliograph
-from tests.map import BORDERS, names_taken_by, parsed
+from tests.map import BORDERS, names_taken_by, parsed, statements
 
 SOURCE = Path(heliograph.__file__).parent
 PACKAGES = SOURCE, SOURCE.parent / "straightline", SOURCE.parents[1] / "studies"
@@ -84,12 +82,16 @@ def imports(path: Path) -> set[str]:
 FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
-def test_imports_flow_with_the_data(path):
-    local = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")
-    assert rank(local) is not None, f"{local}: give it a place in ORDER"
-    for other in imports(path):
-        assert rank(other) <= rank(local), f"{local} imports {other}, which comes later"
+def test_imports_flow_with_the_data():
+    wrong = []
+    for path in FILES:
+        local = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")
+        if rank(local) is None:
+            wrong.append(f"{local}: give it a place in ORDER")
+        else:
+            later = [other for other in imports(path) if rank(other) > rank(local)]
+            wrong += [f"{local} imports {other}, which comes later" for other in later]
+    assert FILES and not wrong, "\n".join(wrong)
 
 
 def import_graph() -> dict[str, set[str]]:
@@ -118,18 +120,24 @@ PUBLIC = [("heliograph", name) for name in HALL] + [
 ]
 
 
-@pytest.mark.parametrize(("place", "name"), PUBLIC, ids=lambda part: part.removeprefix("heliograph."))
-def test_public_names_exist_and_are_documented(place, name):
+def test_public_names_exist_and_are_documented():
+    wrong = [f"{place}.{name}: expected {what}" for place, name in PUBLIC for what in lacking(place, name)]
+    assert PUBLIC and not wrong, "\n".join(wrong)
+
+
+def lacking(place: str, name: str) -> list[str]:
+    """What is expected of a public name and its docstring, and is not there."""
     item = getattr(import_module(place), name)
-    assert not inspect.ismodule(item), f"{name}: expected no module of this name beside it"
     text = inspect.getdoc(item) or ""
-    assert text and "\n" not in text.split(".")[0], f"{name}: expected a first line that says what it is"
+    right = {"no module of this name beside it": not inspect.ismodule(item)}
+    right["a first line that says what it is"] = bool(text) and "\n" not in text.split(".")[0]
     if inspect.isfunction(item):
-        assert not re.search(r"Raises:\s*nothing", text), f"{name}: expected no word of errors where there are none"
-        assert "Raises:" in text or not _raises(item), f"{name}: expected what it raises"
-        made = name.endswith("_filter") and place != "heliograph.testing"
-        if made or item.__module__ == "heliograph.fusion.rules":
-            assert "Source:" in text, f"{name}: expected where it comes from"
+        right["no word of errors where there are none"] = not re.search(r"Raises:\s*nothing", text)
+        right["what it raises"] = "Raises:" in text or not _raises(item)
+        is_filter = name.endswith("_filter") and place != "heliograph.testing"
+        has_source = is_filter or item.__module__ == "heliograph.fusion.rules"
+        right["where it comes from"] = "Source:" in text or not has_source
+    return [what for what, is_right in right.items() if not is_right]
 
 
 def test_every_public_name_stands_in_the_list_of_names():
@@ -193,7 +201,7 @@ def test_no_function_has_forty_lines():
     """Counted without signature and docstring: a longer one has steps that have names."""
     lengths = {}
     for path in (path for package in PACKAGES for path in package.rglob("*.py")):
-        for node in ast.walk(parsed(path)):
+        for node in statements(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 start = node.body[0].end_lineno if ast.get_docstring(node) else node.body[0].lineno - 1
                 lengths[f"{path}: {node.name}"] = node.end_lineno - start

@@ -1,11 +1,11 @@
 """Units do not decide: what is known, singular or indefinite is so in any units, and a limit is a number."""
 
-import jax
 import numpy as np
 import pytest
 
 import heliograph as hg
 from heliograph.model import silent
+from tests.draws import draw
 from tests.follow import last
 
 CART = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
@@ -24,8 +24,7 @@ def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_d
     open_loop = hg.filters.open_loop_filter(plant)
     result = open_loop.estimate(open_loop.predict(open_loop.init())).covariance
     np.testing.assert_allclose(np.diag(result), [1e6 + 1, 1e-9 + 1e-14], rtol=1e-13)
-    with jax.enable_x64(True):
-        drawn = np.asarray(jax.vmap(plant.sample_initial)(jax.random.split(jax.random.key(0), 4000)))
+    drawn = draw(plant.sample_initial, 4000)
     np.testing.assert_allclose(drawn.var(axis=0), [1e6, 1e-9], rtol=0.1)  # 4.5 standard errors
 
 

@@ -161,8 +161,8 @@ def test_loops_end_for_each_run_at_its_turn():
     x = 10.0 ** RANDOM.uniform(-8, 8, size=37)
     y, turns = compile(root, x[0])(x)
     with jax.enable_x64(True):
-        expected = jax.vmap(root)(x)
-        by_jax = jax.vmap(make_jax_function(lower_function(root, x[0])))(x)
+        expected = jax.jit(jax.vmap(root))(x)
+        by_jax = jax.jit(jax.vmap(make_jax_function(lower_function(root, x[0]))))(x)
     np.testing.assert_allclose(y, np.sqrt(x), rtol=1e-15)
     np.testing.assert_array_equal(turns, expected[1])
     np.testing.assert_array_equal(by_jax[1], expected[1])
@@ -183,7 +183,7 @@ def test_arithmetic_on_whole_recordings_is_a_loop_over_their_rows():
     x, y = RANDOM.normal(size=(6, 90, 3)), RANDOM.normal(size=(6, 90))
     result = compile(function, x[0], y[0])(x, y)
     with jax.enable_x64(True):
-        expected = jax.vmap(function)(x, y)
+        expected = jax.jit(jax.vmap(function))(x, y)
     for a, b in zip(result, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
 
@@ -194,7 +194,7 @@ def test_integers_are_sorted_with_what_comes_with_them():
 
     k, x = RANDOM.integers(-3, 4, size=(11, 7, 4)), RANDOM.normal(size=(11, 7, 4))
     with jax.enable_x64(True):
-        expected = jax.vmap(function)(k, x)
+        expected = jax.jit(jax.vmap(function))(k, x)
     for a, b in zip(compile(function, k[0], x[0])(k, x), expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -208,7 +208,7 @@ def test_numbers_of_the_data_choose_rows_of_tables_and_recordings():
 
     x, k = RANDOM.normal(size=(11, 100)), RANDOM.integers(-120, 120, size=11)
     with jax.enable_x64(True):
-        expected = jax.vmap(function)(x, k)
+        expected = jax.jit(jax.vmap(function))(x, k)
     for a, b in zip(compile(function, x[0], k[0])(x, k), expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -225,7 +225,7 @@ def test_special_numbers_are_what_jax_makes_of_them(function):
     x = np.concatenate([RANDOM.normal(size=20), [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, 1e-300, 0.5, -2.5]])
     result = compile(function, x[0])(x)
     with jax.enable_x64(True):
-        expected = jax.vmap(function)(x)
+        expected = jax.jit(jax.vmap(function))(x)
     for a, b in zip(result, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
@@ -239,8 +239,8 @@ def test_random_draws_are_those_of_jax():
     numbers = np.arange(20)
     uniform, normal = compile(draw, numbers[0])(numbers)
     with jax.enable_x64(True):
-        expected = jax.vmap(draw)(numbers)
-        by_jax = jax.vmap(make_jax_function(lower_function(draw, numbers[0])))(numbers)
+        expected = jax.jit(jax.vmap(draw))(numbers)
+        by_jax = jax.jit(jax.vmap(make_jax_function(lower_function(draw, numbers[0]))))(numbers)
     np.testing.assert_array_equal(uniform, expected[0])
     np.testing.assert_allclose(normal, expected[1], rtol=1e-14)
     np.testing.assert_array_equal(by_jax[0], expected[0])
@@ -362,7 +362,7 @@ def test_numbers_are_found_in_a_table_as_jax_finds_them():
     x = np.array([*table, -np.nan, -3.0, 0.5, 1e300])
     assert engine_of(indices, x).startswith("native")
     with jax.enable_x64(True):
-        by_jax = jax.vmap(indices)(x)
+        by_jax = jax.jit(jax.vmap(indices))(x)
     for values, expected in zip(hg.simulation.over_runs(indices, x), by_jax, strict=True):
         np.testing.assert_array_equal(values, expected)
 

@@ -21,7 +21,7 @@ from heliograph.factors import (
 from heliograph.factors.covariance_factors import find_covariance_root
 
 # One program for each size, not one for each of its hundred operations.
-triangularise, eliminate = jax.jit(triangularise), jax.jit(eliminate)
+triangularise, eliminate, decorrelate = (jax.jit(f) for f in (triangularise, eliminate, decorrelate))
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}  # sums of some twenty products of numbers of order 1
 
@@ -38,12 +38,12 @@ def columns(n, count, seed=0):
 
 
 def product(c):
-    return (c.matrix * c.weights) @ np.transpose(c.matrix)
+    return (np.asarray(c.matrix) * np.asarray(c.weights)) @ np.transpose(c.matrix)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 16, 17, 20])
+@pytest.mark.parametrize("n", [1, 2, 5, 9, 25])
 def test_both_ways_to_factors_give_the_sum(n):
-    """Written out up to 16 rows, a loop above."""
+    """Written out up to 24 rows, a loop above."""
     given = columns(n, n + 3)
     for factors in (triangularise(given), eliminate(given.covariance)):
         np.testing.assert_allclose(product(factors), product(given), **EXACT)
@@ -51,7 +51,7 @@ def test_both_ways_to_factors_give_the_sum(n):
         assert np.all(np.asarray(factors.weights) > 0)
 
 
-@pytest.mark.parametrize("n", [4, 18])
+@pytest.mark.parametrize("n", [4, 25])
 def test_a_row_made_of_others_leaves_nothing(n):
     """Exactly nothing of a row of zeros; of twice another the square of rounding, or, eliminated, rounding."""
     given = columns(n, n + 3)
@@ -73,8 +73,14 @@ def test_a_pivot_is_at_least_its_share():
 def test_derivatives_exist_where_variances_are_zero():
     """Of d_2 of W diag(w) W' by the weight of a column that alone carries the second row: its square."""
     matrix = np.array([[1.0, 0.0], [0.5, 3.0]])
-    of_weight = jax.grad(lambda w: triangularise(WeightedColumns(matrix, jnp.stack([0.0 * w, w]))).weights[1])
-    of_pivot = jax.grad(lambda v: eliminate(jnp.diag(jnp.stack([v, 2 * v]))).weights[1])
+
+    def second_of_columns(w):
+        return triangularise(WeightedColumns(matrix, jnp.stack([0.0 * w, w]))).weights[1]
+
+    def second_of_diagonal(v):
+        return eliminate(jnp.diag(jnp.stack([v, 2 * v]))).weights[1]
+
+    of_weight, of_pivot = (jax.jit(jax.grad(f)) for f in (second_of_columns, second_of_diagonal))
     assert of_weight(0.0) == pytest.approx(9.0) and of_pivot(0.0) == pytest.approx(2.0)
 
 
@@ -142,7 +148,7 @@ def test_a_variance_below_zero_by_rounding_leaves_no_pivot_below_zero(n):
             assert np.all(np.asarray(weights) >= 0)
 
 
-@pytest.mark.parametrize("n", [12, 40])
+@pytest.mark.parametrize("n", [12, 26])
 def test_natively_the_noise_of_many_outputs_on_their_own_costs_what_that_of_each_costs(n):
     """Its columns are two of each output: its variance is a sum of two squares, and nothing is correlated.
 

@@ -38,9 +38,16 @@ condition_on_next_state, predict_affine, condition_on_observation, impose_moment
     for f in (condition_on_next_state, predict_affine, condition_on_observation, impose_moments_of_combination)
 )
 rts_step, add_noise_to_image, append_rows = (jax.jit(f) for f in (rts_step, add_noise_to_image, append_rows))
+triangularise, gain_of, from_traced_covariance = (jax.jit(f) for f in (triangularise, gain_of, from_covariance))
+
+
+@jax.jit
+def log_density(seen, present, size):
+    return seen.log_density(present, size)
+
 
 EXACT = {"rtol": 1e-11, "atol": 1e-12}  # some twenty products of numbers of order 1, and a solution
-SIZES = [(1, 1), (3, 2), (5, 3), (18, 4)]
+SIZES = [(1, 1), (3, 2), (5, 3), (9, 4)]  # all written out, which 24 rows are
 
 
 @pytest.fixture(autouse=True)
@@ -88,7 +95,7 @@ def test_observing_is_kalman_s_update(n, m, missing):
     np.testing.assert_allclose(known.mean, mean + gain @ z, **EXACT)
     np.testing.assert_allclose(known.covariance, p - gain @ s @ gain.T, **EXACT)
     density = multivariate_normal(np.zeros(len(z)), s).logpdf(z) if len(z) else 0.0
-    np.testing.assert_allclose(seen.log_density(used, jnp.abs(innovation)), density, **EXACT)
+    np.testing.assert_allclose(log_density(seen, used, jnp.abs(innovation)), density, **EXACT)
 
 
 def added_in_a_loop(slopes, weights, noise):
@@ -152,7 +159,7 @@ def test_nothing_that_arrives_changes_nothing():
     known, seen = condition_on_observation(x, h @ x.root, jnp.full(2, jnp.nan), columns_of(r))
     for a, b in zip(known, x, strict=True):
         np.testing.assert_array_equal(a, b)
-    assert seen.log_density(np.zeros(2, bool), jnp.zeros(2)) == 0
+    assert log_density(seen, np.zeros(2, bool), jnp.zeros(2)) == 0
 
 
 def test_nothing_known_and_nothing_said_changes_nothing():
@@ -166,11 +173,9 @@ def test_an_output_that_others_determine_is_judged_by_them():
     x, rows = from_covariance(np.zeros(1), np.eye(1)), jnp.ones((2, 1))
     both = np.ones(2, bool)
     alone = -0.5 * (0.3**2 + np.log(2 * np.pi))
-    agrees = condition_on_observation(x, rows, jnp.asarray([0.3, 0.3]), zero_covariance(2))[1].log_density(
-        both, jnp.ones(2)
-    )
-    differs = condition_on_observation(x, rows, jnp.asarray([0.3, 0.4]), zero_covariance(2))[1].log_density(
-        both, jnp.ones(2)
+    agrees, differs = (
+        log_density(condition_on_observation(x, rows, jnp.asarray(z), zero_covariance(2))[1], both, jnp.ones(2))
+        for z in ([0.3, 0.3], [0.3, 0.4])
     )
     assert agrees == pytest.approx(alone) and differs == -np.inf
 
@@ -213,7 +218,7 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same():
     np.testing.assert_allclose(np.transpose(found), np.array(gain, dtype=float), rtol=1e-10)
 
 
-@pytest.mark.parametrize(("n", "state_noise"), [(4, 0.0), (4, 1.0), (18, 1.0)])
+@pytest.mark.parametrize(("n", "state_noise"), [(4, 0.0), (4, 1.0), (9, 1.0)])
 def test_smoothing_is_rauch_s(n, state_noise):
     """Of x given x+ known better: m + J (m_s - m+), P + J (P_s - P+) J' with J = P F' (P+)^-1."""
     mean, p, _, _, _ = problem(n, 1)
@@ -230,7 +235,7 @@ def test_smoothing_is_rauch_s(n, state_noise):
     np.testing.assert_allclose(known.covariance, p + gain @ (0.4 * prior - prior) @ gain.T, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [3, 18])
+@pytest.mark.parametrize("n", [3, 9])
 def test_a_part_that_others_determine_says_nothing_of_the_state_before(n):
     """The last part of x+ is the sum of the first two, to rounding: its innovation is that, and its gain is zero."""
     mean, p, _, _, _ = problem(n, 1)
@@ -250,7 +255,7 @@ def test_a_mixture_has_its_moments():
     rng = np.random.default_rng(0)
     means, spreads = rng.normal(size=(3, 2)), np.stack([covariance(rng, 2) for _ in range(3)])
     weights = np.array([0.2, 0.5, 0.3])
-    whole = merge_mixture(jax.vmap(from_covariance)(means, spreads), weights)
+    whole = jax.jit(lambda *law: merge_mixture(jax.vmap(from_covariance)(*law), weights))(means, spreads)
     middle = weights @ means
     apart = means - middle
     np.testing.assert_allclose(whole.mean, middle, **EXACT)
@@ -299,7 +304,7 @@ def test_several_at_once_are_each_alone():
     """Under vmap and with leading axes, bit for bit as alone."""
     rng = np.random.default_rng(1)
     spreads = np.stack([covariance(rng, 3) for _ in range(4)])
-    many = jax.vmap(from_covariance)(np.zeros((4, 3)), spreads)
+    many = jax.vmap(from_traced_covariance)(np.zeros((4, 3)), spreads)
     for i in range(4):
         np.testing.assert_allclose(many.covariance[i], spreads[i], **EXACT)
     assert from_summed_covariance(jnp.zeros(3), columns_of(spreads[0])).root.shape == (3, 3)
@@ -365,7 +370,7 @@ def test_gain_is_that_of_the_covariance_form_and_of_observe():
     draw = np.random.default_rng(5)
     p, r = (root @ root.T for root in (draw.normal(size=(4, 4)), draw.normal(size=(3, 3))))
     c, e = draw.normal(size=(3, 4)), draw.normal(size=3)
-    x, noise = from_covariance(jnp.zeros(4), jnp.asarray(p)), triangularise(columns_of(r))
+    x, noise = from_traced_covariance(np.zeros(4), p), triangularise(columns_of(r))
     gain = gain_of(x, c @ x.root, noise)
     np.testing.assert_allclose(gain, p @ c.T @ np.linalg.inv(c @ p @ c.T + r), rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(gain @ e, condition_on_observation(x, c @ x.root, e, noise)[0].mean, rtol=1e-12)

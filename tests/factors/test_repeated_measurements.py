@@ -109,7 +109,7 @@ def test_noises_without_repetition_are_factored_as_any_covariance(m):
 
 def test_natively_noises_of_many_outputs_on_their_own_cost_what_each_costs():
     """Of an output a square, and whether it is above rounding; what is known to be zero costs nothing."""
-    n = 40
+    n = 26
 
     def noise(w):
         factors = triangularise_noise(WeightedColumns(jnp.diag(w), jnp.ones(n)))

@@ -35,16 +35,16 @@ def test_singer_goes_to_constant_acceleration():
 
 
 def test_a_turn_of_unknown_rate_is_that_of_known_rate():
+    plant = hg.models.coordinated_turn(0.1, 0.01, [0, 1, 0, 0, 0.3], 0.1, dt=0.5)
     with jax.enable_x64(True):
+        transition, slopes = jax.jit(plant.transition), jax.jit(jax.jacfwd(plant.transition))
         for rate in (0.3, -2.0, 1e-5, 0.0):
             known = hg.models.known_turn(0.1, rate, dt=0.5)
-            plant = hg.models.coordinated_turn(0.1, 0.01, [0, 1, 0, 0, rate], 0.1, dt=0.5)
             x = np.array([1.0, 2.0, 3.0, 4.0, rate])
-            np.testing.assert_allclose(plant.transition(x, np.zeros(0))[:4], known.matrix @ x[:4], atol=1e-12)
-            slopes = jax.jacfwd(plant.transition)(x, np.zeros(0))
-            assert np.isfinite(slopes).all()  # also at a rate of zero
-    # The noise is that of constant velocity on each axis.
-    noise = np.asarray(plant.noise_covariance(np.zeros(0)))
+            np.testing.assert_allclose(transition(x, np.zeros(0))[:4], known.matrix @ x[:4], atol=1e-12)
+            assert np.isfinite(slopes(x, np.zeros(0))).all()  # also at a rate of zero
+        noise = np.asarray(plant.noise_covariance(np.zeros(0)))
+    # It is that of constant velocity on each axis.
     np.testing.assert_allclose(noise[:2, :2], hg.models.constant_velocity(0.1, 0.5).noise.covariance, rtol=1e-6)
     assert abs(noise[4, 4] - 0.005) < 1e-9
 

@@ -1,6 +1,5 @@
 """What is kept of an object: worked out once, closed, forgotten with the object, and never what is traced."""
 
-import gc
 import weakref
 from functools import partial
 
@@ -53,12 +52,12 @@ def test_what_is_traced_is_not_cached() -> None:
     assert item.power(2).tolist() == [1.0, 1.0]
 
 
-def test_nothing_keeps_the_object_alive() -> None:
+def test_nothing_keeps_the_object_alive(collect_garbage) -> None:
     item = Holder(1.0)
     item.power(2)
     gone = weakref.ref(item)
     del item
-    gc.collect()
+    collect_garbage()
     assert gone() is None
 
 
@@ -94,11 +93,11 @@ class Compiled:
         self.source = source
 
 
-def test_what_is_made_of_an_object_is_shared_while_somebody_holds_it():
+def test_what_is_made_of_an_object_is_shared_while_somebody_holds_it(collect_garbage):
     make, source = share_by_object(Compiled), Holder(1.0)
     made = make(source)
     assert make(source) is made and make(Holder(1.0)) is not made
     gone = weakref.ref(made)
     del made
-    gc.collect()
+    collect_garbage()
     assert gone() is None and make(source).source is source

@@ -46,7 +46,7 @@ def test_solve(n):
         np.testing.assert_allclose(psd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-9)
 
 
-@pytest.mark.parametrize("n", [3, 10])
+@pytest.mark.parametrize("n", [3, 5])
 def test_a_component_known_exactly_leaves_the_derivatives_of_the_others(n):
     """A = diag(B(p), 0): the factor is that of B, and so is its derivative, though the root has none at 0."""
     b = np.eye(n - 1) + 0.3

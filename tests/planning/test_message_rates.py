@@ -14,6 +14,7 @@ from heliograph.planning.message_rates import (
 
 HALVED, PRECISE = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.002)  # sqrt(4 / 3 / .002) = 25.8
 PLANT, SENSOR = hg.LinearPlant([[0.98]], 0.04, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.01)
+NOISY = hg.LinearSensor([[1.0]], 1.0)  # of which a grid is small
 
 
 @pytest.mark.parametrize(
@@ -54,8 +55,11 @@ def test_the_least_error_at_a_rate_and_what_send_on_delta_has_above_it():
 @pytest.mark.parametrize(("delta", "rate"), [(0.6, 0.08692), (1.0, 0.03262)])
 def test_the_rate_of_send_on_delta(delta, rate):
     assert send_on_delta_rate(PLANT, SENSOR, delta) == pytest.approx(rate, rel=5e-4)
-    scaled = send_on_delta_rate(PLANT, hg.LinearSensor([[10.0]], 1.0), 10 * delta)
-    assert scaled == pytest.approx(rate, rel=5e-4)
+
+
+def test_the_unit_of_a_measurement_changes_no_rate():
+    scaled = send_on_delta_rate(PLANT, hg.LinearSensor([[10.0]], 1.0), 6.0)
+    assert scaled == pytest.approx(0.08692, rel=5e-4)
 
 
 def test_a_rare_message_has_the_rate_of_a_simulation():
@@ -86,7 +90,7 @@ def test_what_has_no_rate_before_data_is_refused_in_one_line():
         (lambda: send_on_delta_rate(two, hg.LinearSensor([[1.0, 0.0]], 1.0), 1.0), "rate before any data: expected a"),
         (lambda: send_on_delta_rate(hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0), SENSOR, 1.0), "plant: expected a stable"),
         (lambda: send_on_delta_rate(HALVED, PRECISE, 0.5), r"at most 36.4 cells of the grid .*, got 52 cells"),
-        (lambda: send_on_delta_rate(PLANT, SENSOR, 20.0), "delta: expected one at which more than 1e-06 messages"),
+        (lambda: send_on_delta_rate(HALVED, NOISY, 12.0), "delta: expected one at which more than 1e-06 messages"),
         (lambda: send_on_delta_rate(PLANT, SENSOR, 2.0**40), "delta: expected one at which more than 1e-06 messages"),
         (lambda: prediction_error_rate(PLANT, SENSOR, 1.0, 1.0), "loss: expected a number below 1"),
         (lambda: least_error(PLANT, SENSOR, 1.5), "rate: expected a number between 0 and 1"),

@@ -1,22 +1,19 @@
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
+from tests.draws import draw
 
 DRAWS = 2000
 LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard deviations each: 9 sigma of the widest
 
 
 def received(channel, y, seed=0):
-    with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(seed), DRAWS)
-        h = jax.jit(jax.vmap(channel.sample))(keys)
-        z = h[:, :-1, :-1] @ jnp.asarray(y) + h[:, :-1, -1]
+    h = draw(channel.sample, DRAWS, seed)
+    z = h[:, :-1, :-1] @ np.array(y) + h[:, :-1, -1]
     bottom = np.eye(1, channel.inputs + 1, channel.inputs)
     assert np.array_equal(h[:, -1:], np.broadcast_to(bottom, (DRAWS, 1, channel.inputs + 1)))
-    return np.asarray(z)
+    return z
 
 
 def test_all_components_are_lost_together_and_the_rest_is_the_channel():

@@ -7,13 +7,13 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.random_affine.outlier_noise import has_bounded_noise
+from tests.draws import draw
 
 R = np.array([[1.0, 0.3], [0.3, 2.0]])
 
 
 def drawn(law, count=100_000):
-    with jax.enable_x64(True):
-        return np.asarray(jax.jit(jax.vmap(law.sample))(jax.random.split(jax.random.key(1), count)))
+    return draw(law.sample, count, seed=1)
 
 
 @pytest.mark.slow

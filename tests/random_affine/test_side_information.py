@@ -1,10 +1,10 @@
 """Side information of a receiver: outcomes against draws."""
 
-import jax
 import numpy as np
 import pytest
 
 import heliograph as hg
+from tests.draws import draw
 
 HALF = hg.erasure(hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.1), 0.5)
 
@@ -20,7 +20,7 @@ def relayed():
 @pytest.mark.parametrize("channel", [HALF, hg.model.with_direct_link(HALF, hg.perfect()), relayed()])
 def test_outcomes_are_those_of_draws(channel):
     """Frequencies of each set of losses in 4,000 draws, within 4 standard errors, and the mean map of what arrived."""
-    draws = np.asarray(jax.vmap(channel.sample)(jax.random.split(jax.random.key(0), 4000)))[:, :-1]
+    draws = draw(channel.sample, 4000)[:, :-1]
     arrived = ~np.isnan(draws).any(axis=2)
     result = channel.list_outcomes()
     np.testing.assert_allclose(sum(o.probability for o in result), 1.0)

@@ -120,11 +120,11 @@ def test_a_long_step_in_live_use_is_generated_in_haste(monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
-def test_code_lets_go_of_the_program_that_it_was_made_of():
+def test_code_lets_go_of_the_program_that_it_was_made_of(collect_garbage):
     """Which takes more memory than the code; only its text stays, to be generated again with care."""
 
     def nodes():
-        gc.collect()
+        collect_garbage()
         return sum(isinstance(x, Node) for x in gc.get_objects())
 
     before = nodes()
@@ -134,7 +134,7 @@ def test_code_lets_go_of_the_program_that_it_was_made_of():
     assert "define void @run" in code.code.blocks.text(8)
 
 
-def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypatch):
+def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypatch, collect_garbage):
     """Freed, it would be another's: a heap that is written over ends the process, or changes numbers."""
     code(STARTS)
     begun, released, made = Event(), Event(), []
@@ -163,7 +163,7 @@ def test_threads_hold_what_they_write_when_nobody_waits_any_more(code, monkeypat
     finally:
         signal.signal(signal.SIGINT, before)
     del machine, arguments
-    gc.collect()
+    collect_garbage()
     assert stopped and len(made) == 2
     assert all(item() is not None for item in made)
     released.set()

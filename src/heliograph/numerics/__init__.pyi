@@ -162,7 +162,9 @@ from .times.timestamp_order import SECOND as SECOND
 from .times.timestamp_order import YEAR as YEAR
 from .times.timestamp_order import find_out_of_order as find_out_of_order
 from .times.timestamp_order import find_unset_stamps as find_unset_stamps
+from .trace_settings import KEPT as KEPT
 from .trace_settings import evaluate_at_points as evaluate_at_points
+from .trace_settings import keep_for_derivatives as keep_for_derivatives
 from .trace_settings import precision_in_use as precision_in_use
 from .trace_settings import use_precision as use_precision
 from .trace_settings import write_short_programs as write_short_programs

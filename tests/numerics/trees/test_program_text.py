@@ -1,5 +1,9 @@
 """Texts of traced programs: equal for equal programs, and different where anything is that a result depends on."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +11,8 @@ import pytest
 
 from heliograph.numerics import write_program_text
 from straightline import operation
+
+ROOT = Path(__file__).parents[3]
 
 
 def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
@@ -26,11 +32,15 @@ def text(table, power: int = 2, dtype=np.float64, below: float = 1.0) -> str:
 
 
 def test_the_same_program_has_the_same_text_whatever_was_traced_before():
+    """Here, again, and in a process that has traced nothing."""
     with jax.enable_x64(True):
         first = text(np.eye(3))
-        again = text(np.eye(3))
-        jax.clear_caches()
-        assert first == again == text(np.eye(3)) and "0x" not in first
+        assert first == text(np.eye(3)) and "0x" not in first
+    program = "import jax, numpy as np; from tests.numerics.trees.test_program_text import text; " + (
+        "jax.config.update('jax_enable_x64', True); print(text(np.eye(3)), end='')"
+    )
+    fresh = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert fresh.stdout == first
 
 
 @pytest.mark.parametrize(

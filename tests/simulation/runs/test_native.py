@@ -209,7 +209,7 @@ def test_many_nodes_are_what_each_is_alone(monkeypatch):
             assert (sums[name][f].claim, whole.estimates[name][f].claim) == (of_record.claim, of_record.claim)
 
 
-def test_what_is_kept_of_a_network_goes_with_it():
+def test_what_is_kept_of_a_network_goes_with_it(collect_garbage):
     """Its world is built once for all simulations, in parts where nodes are many."""
     fused, channel = linear(), hg.hop(hg.Rayleigh(0.8), 0.02)
     filters = {"linear": hg.linear_filter(LINEAR, POSITION, channel)}
@@ -219,7 +219,7 @@ def test_what_is_kept_of_a_network_goes_with_it():
         hg.monte_carlo(network, 3, 8, 0)
         held.append(weakref.ref(network))
     del fused, many, network
-    gc.collect()
+    collect_garbage()
     assert [one() for one in held] == [None, None]
 
 
@@ -268,14 +268,14 @@ def test_keys_of_another_hash_are_simulated_by_xla():
 
 
 @pytest.mark.slow
-def test_of_a_program_that_is_refused_the_reason_stays_alone():
+def test_of_a_program_that_is_refused_the_reason_stays_alone(collect_garbage):
     """A program of 200,000 operations is 100 MB, which a traceback would hold."""
     plant = hg.Plant(lambda x, u: x / (1 + jnp.linalg.svd(jnp.outer(x, x))[1]), 0.1 * np.eye(2), np.ones(2), np.eye(2))
     network = hg.Network(plant, {"a": hg.Node(POSITION, hg.perfect(), {})})
     world = World(plant, make_reception(network), AllFilters(network))
 
     def nodes():
-        gc.collect()
+        collect_garbage()
         return sum(isinstance(x, Node) for x in gc.get_objects())
 
     before = nodes()

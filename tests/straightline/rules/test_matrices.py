@@ -166,7 +166,7 @@ def test_what_a_loop_stored_is_as_symmetric_when_it_is_read_again():
     assert count == (182 + 4) + (182 + 10) + 1 and carried == 20  # one: the row counted backwards
     results = compile(backwards, f[0], steps[0], k[0])(f, steps, k)
     with jax.enable_x64(True):
-        expected = jax.vmap(backwards)(f, steps, k)
+        expected = jax.jit(jax.vmap(backwards))(f, steps, k)
     for a, b in zip(results, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
 
