@@ -15,7 +15,7 @@ from heliograph.cli.run_in_blocks import PrintedLines, WrittenRowCounts, run_in_
 from heliograph.files.stores.store_address import StoreAddress
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from heliograph.report.progress import Advance
     from heliograph.simulation.network import Network
@@ -61,7 +61,6 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.numerics.check import fail
     from heliograph.numerics.times.dates import horizons_in
     from heliograph.report.progress import progress
 
@@ -74,11 +73,7 @@ def run(
     horizons = horizons_in(forecast) if forecast else None
     with progress(STAGES) as advance:
         advance("starting")
-        from heliograph.files.network_file import load_module
-
-        loaded, module = load_module(network)
-        if not any(loaded.claims().values()):
-            raise fail(f"network {network}", "at least one filter to run", "none")
+        loaded, module = _load_network(network)
         _refuse_replacing_inputs(measurements, out, loaded, module.get("sources"))
         said_of_blocks: PrintedLines | None = None  # of a long table, which is not read as a whole but in blocks
         if lag is None:
@@ -102,6 +97,17 @@ def run(
     lines = [(plant.doubted, [*_describe_results(plant.written, place, report), *plant.said]) for plant, place in done]
     for doubted, summary in lines if said_of_blocks is None else [said_of_blocks]:
         _print_lines(list(dict.fromkeys(doubted)), summary)  # each warning once
+
+
+def _load_network(reference: str) -> "tuple[Network, Mapping[str, object]]":
+    """Return a network, and the names in its file; raise ValueError for one without filters to run."""
+    from heliograph.files.network_file import load_module
+    from heliograph.numerics.check import fail
+
+    network, module = load_module(reference)
+    if not any(network.claims().values()):
+        raise fail(f"network {reference}", "at least one filter to run", "none")
+    return network, module
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":

@@ -234,9 +234,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             overall=(gain, offset, factor_covariances(noise)),
         )
 
-    def _angles_in_order(self, plant: AbstractPlant) -> Angles:
-        """Return the places of the angles, drawn states first."""
-        return tuple(i for i, place in enumerate(self.order) if place in plant.angles)
+    def _angles_in_order(self, plant: AbstractPlant | None = None) -> Angles:
+        """Return the places of the angles, drawn states first: of this plant, or of the first mode's."""
+        angles = (plant or list_mode_models(first(self.plant))[0]).angles
+        return tuple(i for i, place in enumerate(self.order) if place in angles)
 
     def _measure(self, sensors: Sequence[AbstractSensor], mode: jax.Array, x: jax.Array) -> jax.Array:
         """Return h(x) of the mode's sensor, of x with the drawn states first."""
@@ -380,18 +381,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""
-        return sum_clouds_for_mean(weight, particles, self._angles_in_order(list_mode_models(first(self.plant))[0]))
+        return sum_clouds_for_mean(weight, particles, self._angles_in_order())
 
     def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
         """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
-        return sum_clouds_for_covariance(
-            weight, particles, sums, self._angles_in_order(list_mode_models(first(self.plant))[0])
-        )
+        return sum_clouds_for_covariance(weight, particles, sums, self._angles_in_order())
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
         back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
-        mean = sums.first.mean(self._angles_in_order(list_mode_models(first(self.plant))[0]))
+        mean = sums.first.mean(self._angles_in_order())
         modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
         return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)
 

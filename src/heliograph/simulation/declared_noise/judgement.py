@@ -277,11 +277,10 @@ def _classify_rows(
     # Rows in which the link declared something and a value came.
     heard = ~np.isnan(log_size) & ~np.isnan(z[:, place.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
-    numbers = int(np.sum(~np.isnan(z[heard][:, place.values])))
-    classes = min(CLASSES, len(np.unique(log_size[heard])), max(numbers // EACH, 1))
-    sizes, shares = log_size[heard], np.arange(1, classes) / max(classes, 1)
-    inner = np.quantile(sizes, shares, method="lower") if heard.any() else np.empty(0)
-    edges = np.array([edge for edge in np.unique(inner) if edge < sizes.max()])
+    sizes, numbers = log_size[heard], int(np.count_nonzero(~np.isnan(z[heard][:, place.values])))
+    classes = min(CLASSES, len(np.unique(sizes)), max(numbers // EACH, 1))
+    inner = np.quantile(sizes, np.arange(1, classes) / classes, method="lower") if classes else np.empty(0)
+    edges = np.unique(inner[inner < np.max(sizes, initial=-np.inf)])
     # Median deviation of each output; of values that are no outputs one by one the geometric mean for all.
     outputs = variances.shape[1] if place.outputs is None else len(place.outputs)
     usual = np.sqrt(np.median(variances[heard], axis=0)) if heard.any() else np.ones(variances.shape[1])
