@@ -23,7 +23,9 @@ def test_delta_and_loss_are_recovered_within_their_intervals():
         return hg.Network(PLANT, {"a": hg.Node(SENSOR, channel, {}, trigger=trigger)})
 
     z = recording(hg.SendOnDelta(0.6), hg.erasure(hg.perfect(), 0.8), 400)
-    fitted = hg.fit(build, {"a": z}, starts=1)
+    said = list[str]()
+    fitted = hg.fit(build, {"a": z}, starts=1, progress=said.append)
+    assert said[0].startswith("1 of 1 starts done, -") and said[1:] == ["interval of arrival", "interval of delta"]
     rows = {row.name: row for row in fitted.table}
     assert fitted.converged and isinstance(fitted, hg.learning.SenderFit)
     assert rows["delta"].low <= 0.6 <= rows["delta"].high and rows["delta"].high - rows["delta"].low < 0.1

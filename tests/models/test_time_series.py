@@ -194,6 +194,7 @@ def test_a_stationary_process_is_fitted():
         (lambda: m.arma([1.1], [], 1.0), "ar: expected coefficients of a stationary process"),
         (lambda: m.seasonal(1, 1.0), "period: expected a whole number of at least 2"),
         (lambda: m.trigonometric_seasonal(12, 1.0, 7), "harmonics: expected from 1 to 6"),
+        (lambda: m.trigonometric_seasonal(1.5, 1.0), "period: expected a number of at least 2"),
         (lambda: m.cycle(11, 1.0, 1.0), "damping: expected a number from 0 to 1"),
         (lambda: m.level(-1.0), "variance of the level: expected a number of at least 0"),
         (lambda: m.structural([m.level(1.0), m.level(1.0)]), "states of joined plants: expected each name once"),

@@ -278,18 +278,19 @@ def fit(
     check_count("starts", starts)
     check_progress(progress, "a line of text")
     description = describe(network)
+    report = progress or (lambda line: None)
     recording, delays = _convert_event_tables(recording)
     if has_deciding_sender(description.start):
         if truth is not False:
             raise fail("truth", "none behind a sender that decides when to send", "one")
-        return replace(fit_sender(description, recording, inputs, starts, check_seed("seed", seed)), delays=delays)
+        sender = fit_sender(description, recording, inputs, starts, check_seed("seed", seed), report)
+        return replace(sender, delays=delays)
     data = gather_data(description.start, recording, inputs, description.parameters.size, truth)
     # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, check_seed("seed", seed))
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
-    report = progress or (lambda line: None)
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
     try:
         identified = identified.at(solutions[-1])

@@ -108,6 +108,7 @@ def fit_sender(
     inputs: ArrayLike | Sequence[ArrayLike] | None,
     starts: int,
     seed: int,
+    say: Callable[[str], None],
 ) -> SenderFit:
     """Return the estimates of a sender's free numbers by the likelihood of `event_filter`, which counts silence too.
 
@@ -122,6 +123,7 @@ def fit_sender(
         inputs: of the plant (steps, inputs), or a list of one array for each recording; None if there are none.
         starts: number of starts of the search.
         seed: seed of those that are drawn.
+        say: called with a line of text at each search and interval.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -146,10 +148,11 @@ def fit_sender(
     # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
-    top = _search_from_starts(likelihood, points)
+    top = _search_from_starts(likelihood, points, say)
     # An interval for each number, as far as Ctrl-C lets the search come.
     rows, stopped = list[Row](), top.stopped
-    for i in range(len(parameters.entries)):
+    for i, entry in enumerate(parameters.entries):
+        say(f"interval of {entry.name}")
         row = _make_row_without_interval(description, top.x, i)
         try:
             rows.append(row if stopped else _add_interval(row, description, likelihood, top, i))
@@ -159,12 +162,15 @@ def fit_sender(
     return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
 
 
-def _search_from_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]]) -> "_BestPoint":
+def _search_from_starts(
+    likelihood: Likelihood, points: Sequence[Float[np.ndarray, " p"]], say: Callable[[str], None]
+) -> "_BestPoint":
     """Return the best end of searches from several starts; after Ctrl-C the best point at which the likelihood was.
 
     Args:
         likelihood: the log-likelihood at a point of the line (p,).
         points: where the searches begin.
+        say: called with a line of text behind each search.
 
     Raises:
         KeyboardInterrupt: before there was a first point.
@@ -183,6 +189,7 @@ def _search_from_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarra
     try:
         for point in points:
             ends.append(_climb_simplex(evaluate, np.asarray(point)))
+            say(f"{len(ends)} of {len(points)} starts done, {max(end.total for end in ends):.6g}")
     except KeyboardInterrupt:
         if best is None:
             raise

@@ -160,19 +160,19 @@ def trigonometric_seasonal(
     "NAME_j" and "NAME_j_shifted"; of period 2 there is the first alone.
 
     Args:
-        period: steps after which it returns, above 1; it need not be whole.
+        period: steps after which it returns, at least 2; it need not be whole.
         variance: of each wave's noise.
         harmonics: number of waves; by default all that differ at whole steps.
         initial_variance: of each state before the first step, or `hg.diffuse`; 1e8 by default.
         name: of the component; "season" by default.
 
     Raises:
-        ValueError: a period up to 1, more waves than differ, a negative variance.
+        ValueError: a period below 2, more waves than differ, a negative variance.
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 2.3.4.
     """
-    # At whole steps the waves j and period - j are the same.
-    length = float(scalar("period", period, 1.0 + 1e-9))
+    # A wave of less than two steps looks at whole steps like a longer one.
+    length = float(scalar("period", period, 2.0))
     most = int(length // 2)
     count = most if harmonics is None else check_count("harmonics", harmonics)
     if not 1 <= count <= most:

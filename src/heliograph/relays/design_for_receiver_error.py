@@ -130,9 +130,9 @@ def minimise_within_limit(
             memory=MEMORY,
         )
         designs.append(np.asarray(_change_gains(gains, units, x.reshape(shape), problem.steps)))
-    # The cheapest that meets all limits.
+    # The cheapest that meets all limits, without those at which a descent overflowed.
     judged = [_compute_cost_and_slack(problem, gains) for gains in designs]
-    costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
+    costs = [float(cost) if np.isfinite(cost) and np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise fail("power limit", "one that some design meets", "one for which none was found")
