@@ -35,10 +35,10 @@ ARRAYS = st.builds(
 )
 EDGES = [2**40, 10**30, -(10**30), 5e-324, 1e-160, 1e16, 1e155, -1e308, np.nan, -np.inf, 1j, "0.1", "1e9", "nan"]
 # No size that could be built and would fill the memory, and nothing whose double is what overflows.
-NUMBERS = st.read_choice(st.integers(-4, 4), st.floats(-1e300, 1e300), st.booleans(), st.sampled_from(EDGES))
+NUMBERS = st.one_of(st.integers(-4, 4), st.floats(-1e300, 1e300), st.booleans(), st.sampled_from(EDGES))
 SOUND = st.characters(exclude_categories=["Cs"])  # all of UTF-8, without a search for what that holds
 LISTS = st.recursive(
-    st.read_choice(NUMBERS, st.none(), st.text(SOUND, max_size=3)), lambda x: st.lists(x, max_size=3), max_leaves=6
+    st.one_of(NUMBERS, st.none(), st.text(SOUND, max_size=3)), lambda x: st.lists(x, max_size=3), max_leaves=6
 )
 THINGS = st.sampled_from(
     [None, b"x", object(), set(), {}, {"a": 1}, {1: 2}, lambda x: x, lambda: 0, np.array([None]), range(2), iter([1]),
@@ -76,7 +76,7 @@ MORE = {  # and what is no such array
 KINDS_OF_ARRAYS = st.builds(
     lambda kind, a: ((KINDS | MORE)[kind])(a.astype(float)), st.sampled_from(sorted(KINDS | MORE)), ARRAYS
 )
-JUNK = st.read_choice(NUMBERS, st.text(SOUND, max_size=4), ARRAYS, KINDS_OF_ARRAYS, LISTS, THINGS)
+JUNK = st.one_of(NUMBERS, st.text(SOUND, max_size=4), ARRAYS, KINDS_OF_ARRAYS, LISTS, THINGS)
 RAW = re.compile(r"e-308|\bany, any\b|\bto inf\b|pydantic|validation error|Tracer")  # words of the works inside
 LENGTH = 500  # of a line that somebody reads
 SECONDS = 60.0  # that one call may take on a busy machine

@@ -105,7 +105,8 @@ def read_measured_plants(
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
         if options.are_for_messages or lag is not None:
-            raise fail("--window, --ahead, --lag and --plant", "messages or events", f"rows of time in {path}")
+            used = "--window, --ahead and --plant" if lag is None else "--lag"
+            raise fail(used, "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]
     measured = [_make_rows_of_events(events.of(plant), plant, options) for plant in wanted]
