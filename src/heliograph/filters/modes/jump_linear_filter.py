@@ -165,7 +165,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     @compile_on_call
     def init(self) -> ModalBelief:
-        """Return the prior, independent of the mode."""
+        """Return the prior of x 1{mode} in each mode; state and mode are independent."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         prior, second = compute_initial_moments(start, self.initial)
         moments, centre = law[:, None, None] * second, jnp.asarray(start.initial_mean)
@@ -204,7 +204,7 @@ class ModalFilter(AbstractJointModalFilter):
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
-        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
+        """Return F L of zeta = E zeta + L xi, zeta the state times each mode's indicator, and columns of its noise."""
         rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
         # What the chain draws moves in its mode.
         among = mode_transition_covariance(state.moments, rows)
@@ -224,7 +224,7 @@ class ModalFilter(AbstractJointModalFilter):
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
-        """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
+        """Return z = common + H zeta + v, zeta the state times each mode's indicator, and columns of Cov v."""
         channel, sensors, law = at(self.channel, k), list_mode_models(at(self.sensor, k)), state.law
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
@@ -286,7 +286,7 @@ def rounding_of_received(gains: jax.Array, sent: jax.Array) -> WeightedColumns:
 
 
 def kron(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return A x B, by a matrix product, which keeps known zeros."""
+    """Return the Kronecker product of a and b, by a matrix product, which keeps known zeros."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
     return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
@@ -309,7 +309,7 @@ def condition_modes_on_received(
 
 
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
-    """Return the law of zeta at the start, and E[x~ x~'].
+    """Return the law of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...) at the start, x~ = (x - c, 1), and E[x~ x~'].
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
@@ -337,7 +337,7 @@ def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, 
     Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
     """
     common = law @ output[:, :, -1] / jnp.sum(law)
-    return output.at[:, :, -1].add(-common), common
+    return output.at[:, :, -1].add(-common), common  # output: E[z 1{mode}] by (x, 1)
 
 
 def concatenate_modes(output: jax.Array) -> jax.Array:
