@@ -343,7 +343,7 @@ class EventFilter(AbstractSizedFilter):
     def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
         heartbeat = self.trigger.heartbeat
-        # A: steps since it sent. It is due at first (not begun), at the heartbeat, and at the last age counted.
+        # A: steps since it sent. It must send at first (not begun), and at the heartbeat where there is one.
         oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
         due = jnp.where(~begun | oldest, label, 0.0)
         return label - due, due

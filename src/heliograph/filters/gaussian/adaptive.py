@@ -307,8 +307,7 @@ def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
         """Return the noise of one step."""
-        # no rule of outliers; behind a gain that may be random
-        return describe_outlier_noise(sensor.noise, None, channel, True)
+        return describe_outlier_noise(sensor.noise, None, channel, True)  # None: no outliers of a last hop
 
     noise: ReceivedNoise | OverTime = at_each_step(describe, filter.sensor, filter.channel)
     return noise

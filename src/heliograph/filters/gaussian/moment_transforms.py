@@ -66,7 +66,7 @@ class AbstractTransform(Module):
 
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
-    """Return the image of x = m + L D^(1/2) xi by f: its mean, its slopes in x's factor, and the covariance left over.
+    """Return the image of x = m + L xi, Cov xi = D, by f: mean, slopes in xi, and the covariance left over.
 
     Slopes: (D^-1 L^-1 Cov(x, f))'; the curvature is Cov f less slopes D slopes'.
     """
@@ -91,7 +91,8 @@ class Cubature(AbstractTransform):
         With s_j = sqrt(n d_j) L_j the differences f(m + s_j) - f(m - s_j) make the slopes, and what the sums
         f(m + s_j) + f(m - s_j) differ by from their mean makes the curvature, both with weights 1 / (4 n).
 
-        x = m + L D^(1/2) xi has n components, d_j the diagonal of D and L_j the columns of its root.
+        x has n components, mean m and covariance L D L': d_j are the diagonal of D (variances), L_j the columns of L
+        (root).
         """
         n = len(x.mean)
         steps = square_root(n * x.variances)

@@ -142,7 +142,7 @@ class CentredFilter(AbstractWrapper):
         """Predict about the origin, which becomes what the center moves to.
 
         The state is a center (`high`) and a Gaussian of small deviations about it. `compensate` evaluates a function
-        with the rest that rounding takes (`low`); `unit`: the rounding of numbers as large as the center.
+        with the rest that rounding takes (`low`); `unit`: eps of the precision.
         """
         plant, center, u = at(self.base.plant, k), jnp.asarray(state.high), jnp.asarray(u)
         unit, x = unit_of(center), state.about_center
@@ -161,8 +161,8 @@ class CentredFilter(AbstractWrapper):
     def correct(self, state: SplitMeanGaussian, z: ArrayLike, k: Step = 0) -> tuple[SplitMeanGaussian, Innovation]:
         """Correct about the origin: subtract the signal of the center from z, and correct the small deviations from it.
 
-        `compensate` evaluates the signal in two parts, `high` and the rest that rounding takes, `low`; `unit`: the
-        rounding of numbers as large as the center.
+        `compensate` evaluates the signal in two parts, `high` and the rest that rounding takes, `low`; `unit`: eps of
+        the precision.
         """
         sensor, channel, center = at(self.base.sensor, k), at(self.base.channel, k), jnp.asarray(state.high)
         unit, z = unit_of(center), jnp.asarray(z)
@@ -217,7 +217,7 @@ def _start_at_zero(base: Any) -> Any:
 def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
     """Return the plant of deviations from a center, whose state starts at zero.
 
-    `level`: f of the center, which is subtracted from f; `unit`: the rounding of numbers as large as the center.
+    `level`: what is subtracted from f, the origin after the step; `unit`: eps of the precision.
     """
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
@@ -229,7 +229,7 @@ def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float
 def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
     """Return the sensor of deviations from a center.
 
-    `level`: h of the center, which is subtracted from h; `unit`: the rounding of numbers as large as the center.
+    `level`: what is subtracted from h, the signal of the center; `unit`: eps of the precision.
     """
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,

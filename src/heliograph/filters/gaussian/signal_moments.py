@@ -107,7 +107,7 @@ def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.A
     `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
     moments before data grow without end where only inputs hold a plant.
 
-    `size`, `reach` are of each output. Of the law's outliers only the Gaussian core is counted.
+    `reach`: bound of |y_i| by roots of second moments, of each output.
     """
     law = sensor.noise
     reach = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))

@@ -238,7 +238,7 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
     A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
     else one that repeats another would measure, without noise, the state times what rounding left of their difference.
 
-    `lost`: variance that rounding has taken from each number already.
+    `lost`: rounding errors that the noise's variances have themselves, where they came out of a subtraction.
     """
     s = system.steps
     of_states, of_received = _second_moments_of_steps(system)
@@ -258,7 +258,7 @@ def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -
 
     Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
 
-    `seconds`: second moments of the numbers; `lost`: the variance of rounding that is in them already.
+    `seconds`: second moments of the numbers; `lost`: rounding errors of the noise's own variances.
     """
 
     def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:

@@ -106,7 +106,8 @@ class AdditiveModalFilter(AbstractModalFilter):
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
         """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law.
 
-        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode; `second`: E[x~ x~'] before data.
+        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode, less its probability; `second`: E[x~
+        x~'] before data.
         """
         move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
         rows = self._transition_matrices(state, k)
@@ -242,7 +243,8 @@ def _next_laws(laws: Laws, rows: Laws) -> Laws:
 def _function_transition(rows: Laws) -> jax.Array:
     """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
 
-    phi: 1 and, of each chain, the indicators of its modes but the first; Pi: the chain's transition matrix (`rows`).
+    phi: 1 and, of each chain, the indicators (less their probabilities) of its modes but the first; Pi: transition
+    matrix.
     """
     parts = [(chain[1:, 1:] - chain[:1, 1:]).T for chain in rows if len(chain) > 1]
     matrix: jax.Array = block_diag(np.eye(1), *parts)

@@ -150,6 +150,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
+
+        `law`: of the move (center, root of the noise's covariance, draws), from which z may draw again; `moved`: not
+        the first step.
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
@@ -164,7 +167,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
-        """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z."""
+        """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z.
+
+        `density`: log p(z); a row that no particle explains is not used. `law`: of the last move, for drawing anew.
+        """
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
         weighed = self.weigh_particles(state.position, state.law, None, proposing, z, k)
@@ -186,6 +192,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
 
         They expected h(x) before z was known (B, p).
+
+        `correction`: log of the law of the move over that of the draw. `numbers`: of the particles, None for all.
         """
         sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
         predicted = received = jax.vmap(sensor.measure)(position)
@@ -205,7 +213,11 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
-        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
+        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference.
+
+        Both: of first and of second order. Atoms: the Gaussians whose mixture the channel is; `predicted`: what
+        particles expect.
+        """
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         both, apart = expected.find_innovations(weight, *predicted)
         return first_sums(both, apart, ()), second_sums(both, apart)
@@ -218,7 +230,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
         k: Step,
         density: jax.Array,
     ) -> Innovation:
-        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
+        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood.
+
+        `received`: first and second sums of innovations about that of the `reference` particle; `density`: log p(z).
+        """
         first, second = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         return expected.compute_innovation(first, second, density)
