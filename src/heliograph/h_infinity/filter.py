@@ -65,7 +65,10 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
-        """Compute the correction of the next estimate from z; the current one stays."""
+        """Compute the correction of the next estimate from z; the current one stays.
+
+        z - mean gain h(x) times the gain of step k; a number that did not arrive adds nothing.
+        """
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
         # Without a covariance there is no likelihood; that of a step in which nothing arrives is 0 in logarithm.
