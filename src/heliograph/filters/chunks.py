@@ -230,7 +230,7 @@ class WarmUpRun(NamedTuple):
 
         `first`: number of each window's first row. None without native code.
         """
-        # The flags: the recursion is the same for all windows, the other three arguments differ.
+        # Flags: the recursion is the same for all windows, the other three arguments differ.
         choice = choose_code(state_after_rows, (self.recursion, states, windows, first), [False, True, True, True])
         return None if choice.code is None else choice.results()
 
@@ -270,7 +270,7 @@ def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarra
 
 
 def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
-    """Return the start states, one each `ahead` rows, in which what does not depend on data is what it is there."""
+    """Return start states, one each `ahead` rows, whose parts that depend on no data are computed up to there."""
     # BLOCKS blocks of `ahead` rows at a time.
     parts, state, size = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):

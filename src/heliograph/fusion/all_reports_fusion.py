@@ -286,7 +286,10 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
-    """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
+    """Return the factors of the covariance of noises that are independent of each other, of all reports together.
+
+    They are the factors of one block-diagonal covariance, age after age and node after node.
+    """
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
     return WeightedColumns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))

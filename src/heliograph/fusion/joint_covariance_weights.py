@@ -30,7 +30,10 @@ def _with_joint_check(weights: Weights) -> Weights:
 
     @wraps(weights)
     def call(joint: Array, *rest: Array) -> Any:
-        """Check the joint covariance, then compute its weights."""
+        """Check the joint covariance, then compute its weights.
+
+        `weights`: the function of the joint covariance that is decorated.
+        """
         shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
         if len(shape) != 4 or shape[:2] != shape[2:]:
             raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or show_value(joint))

@@ -262,7 +262,7 @@ class InverseCovarianceIntersection(AbstractFusion):
         return _combine_claims(claims, "nominal")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Fuse the first two, the result with the third, and so on."""
+        """Fuse the first two by inverse covariance intersection, the result with the third, and so on."""
         mean, covariance = means[0], covariances[0]
         for other, other_covariance in zip(means[1:], covariances[1:], strict=True):
             mean, covariance = intersect_inverse_covariances(mean, covariance, other, other_covariance)

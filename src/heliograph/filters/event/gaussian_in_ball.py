@@ -72,7 +72,10 @@ def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: ja
 
 
 def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
-    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere."""
+    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere.
+
+    `pieces`: moments (piece, ...) where |e_1| <= radius; the components are independent.
+    """
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))

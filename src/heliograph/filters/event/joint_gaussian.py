@@ -33,7 +33,10 @@ class LinkMoments(NamedTuple):
     noise: WeightedColumns
 
     def select_sender(self, sender: slice, m: int) -> "LinkMoments":
-        """Select the outputs that carry a sender's components: all, unless each component has its own sender."""
+        """Select the outputs that carry a sender's components: all, unless each component has its own sender.
+
+        `sender`: its components among the m of y; a link of all components at once is not divided.
+        """
         rows = slice(None) if sender == slice(0, m) else sender
         noise = WeightedColumns(self.noise.matrix[rows], self.noise.weights)
         return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)

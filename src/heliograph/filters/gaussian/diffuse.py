@@ -54,7 +54,10 @@ class DiffuseFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
-        """Predict x over x+ = A x + B u + w."""
+        """Predict x over x+ = A x + B u + w.
+
+        Where something of x is unknown its variance is infinite; E[x_i^2] at the start sets the rounding of the rest.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         return predict_diffuse(state, plant.transition_matrix(u), plant.shift(u), noise)

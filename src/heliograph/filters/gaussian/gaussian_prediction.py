@@ -68,7 +68,10 @@ class AbstractGaussianStateFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Return the mean and covariance of f(x, u) + w."""
+        """Return the mean and covariance of f(x, u) + w.
+
+        Moments of f are those of the filter's transform; E[x_i^2] at the start sets the rounding.
+        """
         return predict_gaussian(
             at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
         )
@@ -122,7 +125,10 @@ def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -
 
 
 def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
-    """Return the moments of f(x, u), exactly where it is linear, else by the transform."""
+    """Return the moments of f(x, u), exactly where it is linear, else by the transform.
+
+    An image is the mean, the slopes in the factors of x, and the covariance that these leave.
+    """
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
     return transform_about_mean(plant, transform, x, u)[1]

@@ -67,6 +67,7 @@ class SequentialFilter(AbstractSizedFilter):
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
         # Filters of different structure: one correction each.
+        # ends: index behind each node's last number.
         ends, innovations = np.cumsum([filter.received for filter in self.filters]), []
         for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
             state, innovation = filter.correct(state, received, k)

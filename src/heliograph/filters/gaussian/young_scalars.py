@@ -165,7 +165,10 @@ def zero_mean_fixed_point_map(
 def _trace_weight(
     omega: jax.Array, cross_square: jax.Array, others: Sequence[jax.Array]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m)."""
+    """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m).
+
+    Omega: a covariance of what is received; the others X are solved with it in the same call.
+    """
     solve = solver(omega)
     first, *rest = jnp.split(solve(jnp.concatenate([cross_square, *others], axis=1)), 1 + len(others), axis=1)
     return solve(first.T), rest

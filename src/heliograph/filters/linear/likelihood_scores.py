@@ -83,7 +83,10 @@ class ScoreRecursion(Recursion):
         return density, score, halves
 
     def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these."""
+        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these.
+
+        `self._start()`: the estimate before the first row, with its derivatives.
+        """
         if not is_long(len(z)):
             return None
         whole = sum_in_chunks(self, self._start(), (z, u))

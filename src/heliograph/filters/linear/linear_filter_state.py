@@ -103,6 +103,8 @@ def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[ja
     """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
     Behind a known gain nothing depends on them.
+
+    `largest`: the root of the largest number, a limit of second moments; a mean is limited by its root.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
     return _clip_to(mean, largest**0.5), _clip_to(covariance, largest)

@@ -218,7 +218,10 @@ def _lift_about_mean(
 
 
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
-    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding."""
+    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding.
+
+    `steps`: the matrices along time, of which the last two are compared.
+    """
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
     return all(np.allclose(step[-1], step[-2], rtol=1e-12, atol=0) for step in system.steps)

@@ -176,6 +176,8 @@ class ModalFilter(AbstractJointModalFilter):
         """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
 
         Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
+
+        zeta: x~ = (x - c, 1) times each mode's indicator; E_i = E[x~ x~' 1{i}]; Pi: the chain; A~, Q~: the plant.
         """
         rows = self._transition_matrix(state, k)
         arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
@@ -194,6 +196,8 @@ class ModalFilter(AbstractJointModalFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j), T_j the
         spread of the gains in mode j.
+
+        zeta: x~ = (x - c, 1) times each mode's indicator; E_j = E[x~ x~' 1{j}]; C~, R~: the sensor; Hbar: mean gain.
         """
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         after, innovation = condition_modes_on_received(state.gaussian, centred, self._measurement_model(state, k), z)
@@ -274,7 +278,10 @@ def factor_with_last_mode(among: jax.Array) -> WeightedColumns:
 
 
 def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
-    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
+    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales.
+
+    Hbar_j: mean gain in mode j of probability P(j), v_j: noise of what is sent, n_j: that of the link.
+    """
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
     return join_columns(*received, side_by_side(channel.noise, law))

@@ -188,7 +188,10 @@ def _find_moments_given_earlier_states(
 
 
 def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced."""
+    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced.
+
+    Nominal: under the probabilities as given, without their radii; traced: free numbers of a fit.
+    """
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     # Bounds of an uncertain law are not used: their maps are zero.

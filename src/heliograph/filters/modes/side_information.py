@@ -195,7 +195,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
-        """Return x = c + sum_j zeta^j, and the covariance of its error."""
+        """Return x = c + sum_j zeta_j, zeta_j the estimate of (x - c) 1{mode j}, and the covariance of its error."""
         projection = make_mode_sum_matrix(len(self.states), len(self.initial))
         mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
         return Estimate(mean, covariance, self.claim)
@@ -269,6 +269,7 @@ def _make_measurement_model(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
         """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain."""
+        # measure, noise: y~ = (y, 1) = measure x~ + noise; size: E[x_i^2] at the start, for rounding.
         sent = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)

@@ -201,6 +201,9 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
     P diag(delta) P is 0 for two modes.
+
+    `low`, `high` (M,): ends of each mode's probability p; `middle`: a law between them, `reach`: the most that p
+    differs.
     """
     modes, (middle, reach) = len(low), _find_middle_law(low, high)
     centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
@@ -224,7 +227,10 @@ def _bound_next_law(rows: jax.Array, radius: jax.Array, low: jax.Array, high: ja
 
 
 def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
+    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first.
+
+    `payoff`, `low`, `high` (M,): what each mode is worth, and the ends of its probability p.
+    """
     # earlier[i, j]: i is served before j, by payoff and then by number.
     number = jnp.arange(len(payoff))
     earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))

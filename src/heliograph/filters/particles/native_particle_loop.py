@@ -212,7 +212,7 @@ def _sum_for_mean(
 
 
 def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
-    """Return the second sums of the states of a group of particles, about the means of all."""
+    """Return second sums of a group's states about the means of all particles, of which `states` has the sums."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
     sums = _unpack_sums(states, filter.sum_for_mean, weight, particles)
     second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
@@ -237,7 +237,7 @@ def _pack_sums(sums: PyTree) -> jax.Array:
 
 
 def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
-    """Return the sums that `_pack_sums` made one vector of, like those of a function of these arguments."""
+    """Return the sums that `_pack_sums` joined in one vector, in the form of a function's of these arguments."""
     leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
     parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
@@ -386,7 +386,7 @@ class _ParticleLoop:
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
-        """Keep what the heaviest particle before z was known expects, of those where it is a number."""
+        """Keep what the heaviest particle before z expects: sums of innovations are taken about it."""
         prior: Any = self.memory.prior
         best: Any = np.argmax(prior)
         if not all(np.isfinite(part[best]).all() for part in self.predicted):

@@ -367,14 +367,14 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> ReceivedSums:
-        """Return sums of how far innovations of particles (B,), modes and atoms are from that of a reference."""
+        """Return sums over particles (B,), modes and the channel's atoms of innovations less that of a reference."""
         base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
     def innovation_from_sums(
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
+        """Return z less its mean over particles, modes and the channel's atoms, its covariance, and log p(z)."""
         return compute_mixture_innovation(
             received, find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles), z, density
         )

@@ -146,7 +146,10 @@ def build_behind_words(
 
 
 def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) -> None:
-    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already."""
+    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already.
+
+    The law of a dither's error is not known where a gain depends on the past (`fades_with_memory`).
+    """
     if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
         expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
         raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
@@ -188,7 +191,7 @@ def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
 
 def _mean_gains(numbers: Channel) -> np.ndarray:
     """Return E[g] of each output of a channel of numbers: its row sums, as each output carries one word."""
-    # numbers: what words stand for
+    # `numbers`: the channel of the values that words stand for.
     steps = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(numbers)]
     if any(not np.array_equal(step, steps[0]) for step in steps):
         raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
@@ -196,7 +199,10 @@ def _mean_gains(numbers: Channel) -> np.ndarray:
 
 
 def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
-    """Return whether what the sensor measures is Gaussian before any data."""
+    """Return whether what the sensor measures is Gaussian before any data.
+
+    So it is where the initial law and all noises of plant and sensor are Gaussian.
+    """
     laws: list[object] = [first(plant).deviation]
     laws += [step.noise for step in unstack(plant)] + [step.noise for step in unstack(sensor)]
     return all(isinstance(law, Gaussian) for law in laws if isinstance(law, AbstractNoise))

@@ -162,7 +162,7 @@ class WordFilter(AbstractGaussianStateFilter):
         if_right = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
         # Both answers from the same sums, over all words and over those that are right: not right is all less right.
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
-        # of all and of right words
+        # Weights of the sums over all words, and then of those over the right ones.
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
         return find_effect_of_bits(

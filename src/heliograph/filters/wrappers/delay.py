@@ -52,7 +52,10 @@ class PartFilter(AbstractWrapper):
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Plan the larger filter, and keep the rows of its plan that belong to the first n states."""
+        """Plan the larger filter, and keep the rows of its plan that belong to the first n states.
+
+        A plan has the filter's matrices for these inputs; its projection takes the plan's mean to states.
+        """
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)

@@ -101,6 +101,7 @@ class ToldFilter(AbstractWrapper):
 
         Of the link by the law of its numbers, or of typical ones where that is unknown (`knows_law_of_numbers`).
         """
+        # An expectation is minus the innovation of a measurement of zeros.
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
         return self._place_innovation(filter.correct(state, jnp.zeros(len(self.values)), k)[1])
 
