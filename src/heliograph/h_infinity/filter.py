@@ -131,7 +131,7 @@ def h_infinity_filter(
 def _check_sizes(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign) -> None:
     """Raise ValueError unless plant, sensor, system and design fit each other, without attitudes and angles.
 
-    WITHOUT_ATTITUDE: the words for a plant without attitudes.
+    WITHOUT_ATTITUDE: the words that say what is expected, a plant without attitudes.
     """
     plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
     if plant_0.attitude:

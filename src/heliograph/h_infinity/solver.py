@@ -56,7 +56,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 def run_solver(problem: "Problem", solver: Solver) -> str:
     """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too.
 
-    SCS_ACCURACY, SCS_ITERATIONS: settings of the solver SCS, finer than its own.
+    SCS_ACCURACY, SCS_ITERATIONS: accuracy (finer than its own) and most iterations of the solver SCS.
     """
     cp = import_cvxpy()
     solve: Callable[..., object] = problem.solve  # it has no types

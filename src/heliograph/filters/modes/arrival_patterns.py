@@ -47,7 +47,8 @@ def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M
 
     `flags`: P(flag | mode).
 
-    A pattern says which components arrive. The first step has its own transition, which is not used.
+    A pattern says which components arrive. The transition to a step is that of the step before; the first step, which
+    has none before, takes its own.
     """
     outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}

@@ -67,7 +67,7 @@ class ExpectedMeasurement(NamedTuple):
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
     """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any.
 
-    `predicted`: what particles expect of z, in several arrays; a number: finite.
+    `predicted`: what particles expect of z, in several arrays; they are numbers if all are finite.
     """
     xp = library(weight, predicted)
     finite = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]

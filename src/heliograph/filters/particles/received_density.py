@@ -157,7 +157,7 @@ def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineC
 def _check_noise(covariance: np.ndarray) -> None:
     """Raise ValueError unless every combination of what arrives has noise.
 
-    CERTAIN: the least eigenvalue of the noise's correlations, 1e-14, up to which a combination has none.
+    CERTAIN: 1e-14, the eigenvalue of the noise's correlations up to which a combination has no noise.
     """
     deviation = np.sqrt(np.diagonal(covariance))
     correlation = covariance / np.outer(*[np.where(deviation > 0, deviation, 1.0)] * 2)
