@@ -180,7 +180,7 @@ class AbstractFilter(Module):
     def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
     ) -> tuple[PyTree, SmootherStep]:
-        """Step like `step`, and return the smoother step in place of the estimate.
+        """Step like `step`; in place of the estimate return what a backward pass over the data needs of the step.
 
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
@@ -199,7 +199,7 @@ class AbstractFilter(Module):
         values = check_vector("measurement", z, self.received or None)
         if isinstance(values, np.ndarray) and np.isinf(values).any():
             raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(values).tolist())
-        return values if self.received else values[:0]
+        return values if self.received else values[:0]  # of no length for a filter without measurements
 
     def check_input(self, u: ArrayLike) -> Float[Array, " inputs"]:
         """Return u as an input of the filter's length.
@@ -320,7 +320,7 @@ def _step(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 def step_with_judgement(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Judgement, Innovation]:
-    """Step a filter, and return the estimate, the judgement of the measurement, and its innovation."""
+    """Step a filter; return its state, the estimate, the judgement (are the data plausible?) and the innovation."""
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
@@ -334,7 +334,7 @@ def step_with_judgement(
 def _step_with_smoother(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, SmootherStep]:
-    """Predict, correct and return state and smoother step: compiled body of `AbstractFilter.step_with_smoother`."""
+    """Predict and correct, compiled; return the state, and what a backward pass needs of this step."""
     prior = filter.predict(state, u, k)
     after, innovation = filter.correct(prior, z, k)
     return after, make_smoother_step(filter, StepTrace(state, prior, after, innovation, z, u, k))
@@ -359,7 +359,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
-    """Compute a filter's `estimate(state)` in double precision, and refuse what is no state of such a filter.
+    """Return the method, made to compute in double precision and to refuse what is no state of its filter.
 
     Args:
         estimate: the method of a filter.
@@ -391,7 +391,7 @@ def _compile_with_checks(
 def check_step_number(filter: AbstractFilter, k: Step) -> Step:
     """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
-        return k
+        return k  # inside a compiled computation it has no value to check
     is_one = isinstance(k, int | np.integer | np.ndarray | jax.Array) and not np.shape(k)
     if not is_one or np.asarray(k).dtype.kind not in "iu" or np.asarray(k) < 0:
         raise fail("step", "a whole number from 0", show_value(k))

@@ -51,7 +51,11 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
 
 @cache
 def _wrap_with_input_test(function: Callable[..., R]) -> Callable[..., tuple[R, Array]]:
-    """Return the function that also says whether the inputs spoil a step."""
+    """Return the function that also says whether the inputs spoil a step.
+
+    Inputs spoil a step if the plant's functions of them are no finite numbers, or no covariance. The result is kept by
+    function.
+    """
 
     @compile_on_call
     def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:

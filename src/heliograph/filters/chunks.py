@@ -100,6 +100,7 @@ def filter_in_chunks(
         state: before the first row; that before any unless given.
         begin: number of the first row.
     """
+    # `start`: the filter's state before any data; None where the filter is not linear.
     start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
@@ -113,15 +114,20 @@ def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[...
     if start is None:
         return None
     whole = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
+    # The outputs are sums of each chunk (chunks, ...).
     return None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
 
 
 def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
-    """Step a recursion over rows in chunks side by side; None where rows are few, or it forgets too late."""
+    """Step a recursion over rows in chunks side by side; None where rows are few, or it forgets too late.
+
+    Return the last state and what is kept of each row. `start`: the state before the first row.
+    """
     with jax.enable_x64(True):
         whole = _scan_all_chunks(recursion, start, rows, OF_ROWS)
     if whole is None:
         return None
+    # Chunks (chunks, rows, ...) one after the other, without the rows that fill up the last one.
     total = len(jax.tree.leaves(rows)[0])
     joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], whole.outputs)
     return ScanResult(whole.last, joined)
@@ -224,6 +230,7 @@ class WarmUpRun(NamedTuple):
 
         `first`: number of each window's first row. None without native code.
         """
+        # Flags: the recursion is the same for all windows, the other three arguments differ.
         choice = choose_code(state_after_rows, (self.recursion, states, windows, first), [False, True, True, True])
         return None if choice.code is None else choice.results()
 
@@ -236,6 +243,7 @@ def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray,
     """
     starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(warm_up, starts, first)
+    # Not forgotten, the state has a part that depends on no data, and no settled state was found: compute that part.
     if forgets is False and jax.tree.leaves(beside_gaussians(start)) and warm_up.settled is None:
         starts = _replace_data_free_parts(warm_up.recursion, start, warm_up.rows, warm_up.ahead)
         forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
@@ -262,7 +270,7 @@ def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarra
 
 
 def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
-    """Return starts, one each `ahead` rows, with what a state holds there beside its Gaussians."""
+    """Return start states, one each `ahead` rows, whose parts that depend on no data are computed up to there."""
     # BLOCKS blocks of `ahead` rows at a time.
     parts, state, size = list[PyTree](), start, BLOCKS * ahead
     for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
@@ -311,6 +319,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
 
     def scan(states: PyTree, which: Which) -> PyTree:
         """Return the results of the chunks `which`, filtered in full from these states."""
+        # rows: all data; total: their number; length: rows of a chunk; begun.first: the first row of each chunk.
         parts = [
             (recursion, take(states, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
@@ -320,6 +329,7 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     def scan_means(settled: SettledState) -> PyTree:
         """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
         means = means_of(begun.states)
+        # rows: all data; total: their number; length: rows of a chunk; begun: state and first row of each chunk.
         parts = [
             (recursion, settled, take(means, part), windows, first, total)
             for part, first, windows in take_windows_in_parts(rows, begun.first, length)
@@ -340,12 +350,15 @@ def scan_means_where_settled(
 ) -> PyTree:
     """Scan all chunks: of settled ones the means alone, the others in full; None without native code.
 
+    A chunk is settled if its covariances and gains stay as they are from its first row on, so that only means change.
+
     Args:
         begun: how the chunks begin.
         scan_in_full: results of some chunks from the states with which these begin.
         scan_means: results of all chunks, as if they were settled; None where these do not settle.
     """
     # The means are scanned of all chunks, which does not pay where few are settled.
+    # `covered`: which chunks are settled.
     settled = None if np.mean(begun.covered) < 0.5 else begun.settled
     results = None if settled is None else scan_means(settled)
     if results is None:

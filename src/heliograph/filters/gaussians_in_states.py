@@ -61,7 +61,10 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_largest_slopes(states: PyTree) -> Iterator[float]:
-    """Return of the derivatives in each number the largest among states (n, ...), in deviations of their Gaussian."""
+    """Yield for each derivative in the states (n, ...) its largest entry, in standard deviations of its Gaussian.
+
+    A state's moving parts are Gaussians, each followed by the derivatives of its mean and covariance.
+    """
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):
             gaussian = part
@@ -73,7 +76,10 @@ def _find_largest_slopes(states: PyTree) -> Iterator[float]:
 
 
 def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, "..."]:
-    """Return which entries differ by no more than is allowed, or are both NaN."""
+    """Return which entries differ by no more than is allowed, or are both NaN.
+
+    `within`: what is allowed, beside ROUNDING, 16 eps of the number itself.
+    """
     with np.errstate(invalid="ignore"):  # of numbers that overflowed
         near: np.ndarray = np.abs(a - b) <= within + ROUNDING * np.abs(b)
     near |= np.isnan(a) & np.isnan(b)
@@ -97,6 +103,7 @@ def means_of(state: PyTree) -> list[Any]:
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
     """Return a state whose Gaussians, and their derivatives, have other means."""
+    # A part moves if its mean depends on data: a Gaussian, or a derivative of one.
     next_mean = iter(means)
     return jax.tree.map(
         lambda part: part._replace(mean=next(next_mean)) if _is_moving(part) else part, state, is_leaf=_is_moving
@@ -113,6 +120,7 @@ def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
 
     `beside` is what `beside_gaussians` returns.
     """
+    # A part moves if it is a Gaussian or a derivative of one.
     parts = iter(_leaves_beside(beside))
     return jax.tree.map(lambda part: part if _is_moving(part) else next(parts), state, is_leaf=_is_moving)
 

@@ -26,6 +26,7 @@ def gaussian_innovation(
     """
     present = ~jnp.isnan(z)
     value, both = jnp.asarray(z - expected), present[:, None] & present
+    # The sizes of both terms of the difference say how large its rounding is.
     likelihood = log_density(value, jnp.asarray(covariance), jnp.abs(z) + jnp.abs(expected))
     return Innovation(value, jnp.where(both, covariance, jnp.nan), likelihood)
 
@@ -60,6 +61,8 @@ def innovation_of_mean_covariance(
 ) -> "Innovation":
     """Return the innovation of a mixture, by the mean covariance within its components.
 
+    The covariance is the mean within plus that of the means between.
+
     Args:
         weight: prior probability (parts,) of each component.
         value: its innovation (parts, m).
@@ -81,6 +84,8 @@ def posterior_weights(
     """Return posterior weights p_a N(z; ...) of a mixture, log-likelihood of z, and whether all components exclude z.
 
     `likelihood`: log N(z; ...) of each component, -inf where it excludes z. Where all do, the weights stay as they are.
+
+    `weight`: prior probabilities p_a of the components.
     """
     # log p_a N(z; ...), and -inf of a component that is impossible, whatever it says.
     possible = jnp.asarray(weight) > 0
@@ -154,12 +159,16 @@ class InnovationSummary(NamedTuple):
         if not self.received:
             return f"received 0 of {self.expected}"
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
+        # `half`: half width of the 95 % interval; round to as many digits as the standard error has, half / 1.96.
         half = (self.bias_high - self.bias_low) / 2
         bias, error = (round_to(number, half / NORMAL) for number in (self.bias, half))
         return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {bias} +- {error}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
-        """Return a line of warning where a filter left out most values of an output, which outliers are not."""
+        """Return a line of warning where a filter left out most values of an output, which outliers are not.
+
+        MOST: one half. The lower limit of the share's interval must be above it.
+        """
         if not self.share.low > MOST:
             return []
         return [
@@ -175,6 +184,8 @@ class InnovationSummary(NamedTuple):
 
         Shares p with intervals (l, u), of one output and of the others together: p_1 - p_2 is above 0 by more than
         sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
+
+        `independent`: how many independent values would have the same interval; `wilson`: Wilson's interval of a share.
 
         Args:
             summaries: one of each output.

@@ -34,7 +34,11 @@ class FilterRecursion(Recursion):
     begin: Array = eqx.field(default_factory=lambda: np.asarray(0))
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Predict and correct."""
+        """Predict and correct; return the state after the row, and what is kept of the row.
+
+        `begin`: number of the recording's first row; `output`: what is kept, a function of filter, state, innovation,
+        number.
+        """
         (z, u), number = row, self.begin + k
         after, innovation = self.filter.correct(self.filter.predict(state, u, number), z, number)
         return after, self.output(self.filter, after, innovation, number)
@@ -47,10 +51,13 @@ def initial_state_if_linear(filter: Any) -> PyTree | None:
 
 
 def scan_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, count: Array) -> tuple[PyTree, PyTree]:
-    """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays."""
+    """Scan rows from number `first` on; from row `count` on, behind the end of the data, the state stays.
+
+    Return the last state and what is kept of each row.
+    """
 
     def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
-        """Step over one row."""
+        """Step over one row; from row `count` on, behind the end of the data, the state stays."""
         data, k = row
         after, output = recursion.step(state, data, k)
         return select_state(k < count, after, state), output
@@ -71,10 +78,16 @@ def sum_chunk(recursion: Recursion, state: PyTree, rows: PyTree, first: Array, c
 def sum_rows(
     step: Callable[..., tuple[PyTree, PyTree]], state: PyTree, rows: PyTree, first: Array, count: Array
 ) -> tuple[PyTree, PyTree]:
-    """Step over rows from number `first` on, before row `count`: the last state, and the sums of what steps return."""
+    """Step over rows from number `first` on, before row `count`: the last state, and the sums of what steps return.
+
+    `count`: number of the row at which the data end; from it on nothing changes.
+    """
 
     def body(now: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
-        """Step over one row and add its output; from row `count` on nothing changes."""
+        """Step over one row and add its output; from row `count` on nothing changes.
+
+        `now`: the state and the sums of outputs; `step`: returns state and output of a row.
+        """
         (state, sums), (data, k) = now, row
         after, output = step(state, data, k)
         return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None

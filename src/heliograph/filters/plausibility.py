@@ -83,6 +83,8 @@ class Judgement(NamedTuple):
         """Judge a prediction by itself, as a step without data; arguments as of `judge_step`.
 
         `states`, `estimates`: before and after the prediction. `spoilt`: whether its inputs were no numbers.
+
+        `claim`: "none" if the filter claims no covariance.
         """
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
         empty = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
@@ -96,6 +98,7 @@ class Judgement(NamedTuple):
     ) -> "Judgement":  # fmt: skip
         """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
         (prior, after), (expected, corrected) = states, estimates
+        # A correction has no prediction: the state before it counts as before and after one.
         return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
 
     @staticmethod
@@ -116,6 +119,7 @@ class Judgement(NamedTuple):
             excuses: whether the row is plausible without a value.
         """
         ordered = sorted(candidates, key=size, reverse=True)
+        # Of one value alone nothing is computed again.
         if len(ordered) == 1:
             return ordered[0]
         return next((one for one in ordered if excuses(one)), ordered[0])
@@ -127,7 +131,11 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def describe(reason: float, distance: float) -> str:
-        """Describe in words why something is implausible, with the bound of the precision that the distance has."""
+        """Describe in words why something is implausible, with the bound of the precision that the distance has.
+
+        `reason`: number of a `Reason`; `distance`: squared, in deviations; LIMIT: the bound in double precision, 1e6;
+        WORDS: texts of the other reasons.
+        """
         if Reason(int(reason)) != Reason.FAR:
             return WORDS[Reason(int(reason))]
         most = np.sqrt(largest_plausible_distance(np.asarray(distance).dtype))
@@ -141,6 +149,9 @@ class Judgement(NamedTuple):
 
         A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it
         alone skips them. A filter that claims no covariance judges nothing but its state.
+
+        `votes`: one row for each filter: squared distance (NaN: cannot judge), numbers arrived, reason (0: plausible),
+        judgement of inputs.
         """
         distance, _, reason, _ = votes.T
         bad = reason > 0
@@ -151,7 +162,11 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
-        """Return why inputs are implausible, None unless some filter judges them so and none that can disagrees."""
+        """Return why inputs are implausible, None unless some filter judges them so and none that can disagrees.
+
+        `votes`: one row for each filter: squared distance, numbers arrived, reason, judgement of inputs (1: bad, NaN:
+        cannot judge). INPUT: the text for inputs that cost the mean its digits.
+        """
         predicted = votes[:, 2] == Reason.PREDICTION
         bad = (votes[:, 3] > 0) | predicted
         if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
@@ -160,7 +175,10 @@ class Judgement(NamedTuple):
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
-    """Return e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did."""
+    """Return e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did.
+
+    e: innovation, S: its covariance. What did not arrive gets variance 1 and innovation 0, and adds nothing.
+    """
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
     total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
@@ -266,7 +284,11 @@ def _judge_value(innovation: Innovation, z: Float[Array, " m"], of_atoms: bool) 
 def _squared_distance_terms_in_turn(
     value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return e_j^2 / s_j of each component in use given those before it, and which of them the others determine."""
+    """Return e_j^2 / s_j of each component in use given those before it, and which of them the others determine.
+
+    e_j: innovation given the components before, s_j: its variance. `used`: which components count; `size`: of the
+    numbers subtracted, for rounding. A determined one has no variance but rounding.
+    """
     padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
     squares, determined = squared_distance_terms(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
     return jnp.where(used, squares, 0.0), used & determined
@@ -279,7 +301,11 @@ def _are_finite(estimates: Estimate, claim: Claim) -> jax.Array:
 
 
 def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
-    """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before."""
+    """Return whether all is finite, and no variance is below zero by more than rounding of the covariance before.
+
+    NEGATIVE_TOLERANCE: how much below zero, as a share, is rounding. Without a claim ("none") there is no covariance to
+    judge.
+    """
     if claim == "none":
         return _are_finite(estimates, claim)
     variances_after = jnp.diagonal(jnp.asarray(estimates.covariance))
@@ -291,7 +317,11 @@ def _is_sound_correction(estimates: Estimate, claim: Claim, before: Estimate) ->
 
 
 def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
-    """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it."""
+    """Return whether all is finite and no variance negative, to the rounding of the largest, which may enter it.
+
+    NEGATIVE_TOLERANCE: how much below zero, as a share, is rounding. Without a claim ("none") there is no covariance to
+    judge.
+    """
     if claim == "none":
         return _are_finite(prior, claim)
     variances = jnp.diagonal(jnp.asarray(prior.covariance))
@@ -317,5 +347,5 @@ def _mask_rounded_away(estimates: Estimate) -> jax.Array:
     """Return the mask of the states whose deviation is positive but below the rounding of their mean."""
     mean = jnp.asarray(estimates.mean)
     variance = jnp.diagonal(jnp.asarray(estimates.covariance))
-    unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)
+    unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)  # of rounding
     return jnp.asarray((variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit))

@@ -40,7 +40,10 @@ class NoiseBranches(NamedTuple):
     least: jax.Array
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
-        """Return the mean and variance of the mixture, (m,) each."""
+        """Return the mean and variance of the mixture, (m,) each.
+
+        Branches are the Gaussians of the mixture, along the second axis.
+        """
         share = jnp.exp(self.log_share)
         center = jnp.sum(share * self.mean, axis=1)
         return center, jnp.sum(share * (self.variance + (self.mean - center[:, None]) ** 2), axis=1)
@@ -72,6 +75,9 @@ class ReceivedNoise(Module):
         Branch j of a noise before the gain arrives with mean E[g] m_j and variance
         E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
         mean together. With that of the signal alone, Var(g) y^2, it is at least E[g^2] r_j.
+
+        A branch is one Gaussian of the noise's mixture, with mean m_j and variance r_j; g: random gain, y: the signal;
+        `late`: noise behind the gain; `least`: the variance without the spread.
         """
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
         signal = (self.output @ sensed)[:, None]
@@ -158,6 +164,9 @@ def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -
 
     `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
 
+    TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared: then
+    each component brings the output of its own number.
+
     Raises:
         ValueError: one that brings the noise of several.
     """
@@ -201,6 +210,8 @@ def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
     Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
+
+    A branch is one Gaussian of a mixture; its probability is the product of both.
     """
     xp = library(sensed, late)
     shape = (len(sensed.mean), sensed.mean.shape[1], late.mean.shape[1])
@@ -216,7 +227,10 @@ def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple
 
 
 def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vector:
-    """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law."""
+    """Return the degrees of freedom of each output's Student noise; NaN where the noise has another law.
+
+    `late`: noise of the last hop, None if there is none; a sum of two is no Student noise.
+    """
     parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
         component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None

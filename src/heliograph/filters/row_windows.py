@@ -21,7 +21,10 @@ class WindowBatch(NamedTuple):
 
 
 def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> Iterator[WindowBatch]:
-    """Yield windows as `take_windows` returns them: first those that are views, then the others."""
+    """Yield windows as `take_windows` returns them: first those that are views, then the others.
+
+    `begin`: first rows of the windows; the first ones follow one another within the data, and need no copy.
+    """
     total, place = len(jax.tree.leaves(rows)[0]), np.arange(len(begin)) * length
     views = int(np.sum((begin == place) & (place + length <= total)))
     for which in (slice(views), slice(views, None)):
@@ -44,7 +47,11 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array: a view, blocks of rows, or copied one by one."""
+        """Return the windows of one array: a view, blocks of rows, or copied one by one.
+
+        Closed over: `begin`, first rows of the windows; `length` of each; `total` rows; `are_first_blocks`: windows are
+        the first rows in order; `are_blocks`: each is a block of rows that begins at a multiple of the length.
+        """
         if are_first_blocks:
             return leaf[: len(begin) * length].reshape(len(begin), length, *leaf.shape[1:])
         if are_blocks:
@@ -54,6 +61,7 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
         for window, place in zip(windows, begin, strict=True):
             part = leaf[place : place + length]
             window[: len(part)] = part
+            # Behind the end of the data the last row is repeated.
             window[len(part) :] = leaf[-1]
         return windows
 
@@ -64,6 +72,8 @@ def run_and_join(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...
     """Return the results of runs of several lists of arguments in the same arrays; None without native code.
 
     `differs` says of which arguments each run has its own.
+
+    Lists of arguments differ in length of the axis of runs; the same compiled code computes all.
     """
     choices = [choose_code(function, arguments, differs) for arguments in parts]
     codes = [choice.code for choice in choices]

@@ -141,7 +141,10 @@ def scan_with_last_state(
     # are mostly the same in every row.
     @partial(jax.checkpoint, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
     def step(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Predict and correct over one row (number, measurement, input); return the state after it, and its output."""
+        """Predict and correct over one row (number, measurement, input); return the state after it, and its output.
+
+        In a derivative the step is computed again, and only what carries a name in KEPT is held in memory.
+        """
         k, z_k, u_k = row
         after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
         return after, output(after, innovation, k)
@@ -205,7 +208,7 @@ def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, d
         dates: of the rows; None where they have none, and their numbers are their times.
     """
     last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_median_spacing(dates))
-    months = 0 if dates is None else find_months_between_rows(dates)
+    months = 0 if dates is None else find_months_between_rows(dates)  # 0: spacing not in calendar months
     return Origin(
         model=filter,
         state=state,
@@ -218,7 +221,10 @@ def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, d
 
 
 def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) -> None:
-    """Warn where means (rows, n) are no finite numbers, from which row on; `begin` rows were before."""
+    """Warn where means (rows, n) are no finite numbers, from which row on; `begin` rows were before.
+
+    hg.run judges each value; this call does not.
+    """
     lost = find_not_finite(mean, 1)
     if lost.any():
         row = begin + int(np.argmax(lost)) + 1
@@ -244,7 +250,10 @@ def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
 
 
 def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) -> None:
-    """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before."""
+    """Warn of rows that no particle explains, and of effective numbers below FEW (steps,); `begin` rows were before.
+
+    FEW: the least effective number of particles, 10. A row that none explains has log-likelihood -inf.
+    """
     unused = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
     few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
     if len(unused):
@@ -259,7 +268,10 @@ def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) ->
 def _compute_filtered(
     filter: SteppedFilter, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> PyTree:
-    """Filter all rows and return the results stacked: compiled body of `run_over_data`."""
+    """Filter all rows and return the results stacked: compiled body of `run_over_data`.
+
+    `begin`: number of the first row; `state`: before it.
+    """
     return scan_with_last_state(filter, z, u, partial(_collect_row_results, filter), state, begin)
 
 

@@ -43,7 +43,10 @@ class SettledState(NamedTuple):
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
-        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary; the others are common."""
+        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary; the others are common.
+
+        `varies`: of each leaf, whether it depends on data; `outputs`: what a settled row keeps.
+        """
         chunks, rows = varying[0].shape[:2]
         leaves, form = jax.tree.flatten(self.outputs)
 
@@ -55,7 +58,10 @@ class SettledState(NamedTuple):
         return self._replace(outputs=jax.tree.unflatten(form, filled)).fill_row(varying)
 
     def fill_row(self, varying: list[Any]) -> PyTree:
-        """Return what is kept of a row, from those of its leaves that vary; the others are common."""
+        """Return what is kept of a row, from those of its leaves that vary; the others are common.
+
+        `varies`: of each leaf, whether it depends on data; `outputs`: what a settled row keeps.
+        """
         next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
@@ -67,6 +73,7 @@ class SettledState(NamedTuple):
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
         """Test which states (n, ...) are this one but for the means."""
         means = means_of(states)
+        # All leaves but the means, which are replaced by nothing.
         beside, own = (jax.tree.leaves(with_means(x, [()] * len(means))) for x in (states, self.state))
         # Most have the same numbers. The others may have others for the same covariance, which are compared by it.
         same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(beside, own, strict=True)]
@@ -81,6 +88,8 @@ class SettledState(NamedTuple):
 
 def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> SettledState | None:
     """Find the state that complete rows lead to; None where there is none, or no native code.
+
+    TURNS (4) times `ahead` rows are passed, as two windows; settled is a state that the second leaves as it was.
 
     Args:
         recursion: filters over rows.
@@ -142,6 +151,8 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
     """Return which leaves of what is kept of a complete row depend on data.
 
     None if more than the means of the state depends on data, or without native code.
+
+    `choice.code.common`: of each result, whether runs with different data share it; `means` of states may differ.
     """
     rows, means = jax.tree.map(lambda leaf: leaf[None], row), [np.asarray(mean)[None] for mean in means_of(start)]
     arguments = recursion, start, means, rows, np.zeros(1, int)
@@ -157,7 +168,10 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
 def step_settled(
     recursion: Recursion, state: PyTree, means: Sequence[Array], row: PyTree, k: Array
 ) -> tuple[PyTree, PyTree]:
-    """Step over a complete row from a state with other means."""
+    """Step over a complete row from a state with other means; return the state and what is kept of the row.
+
+    `present` marks numbers as surely there, so that nothing depends on whether they are.
+    """
     z, u = row
     return recursion.step(with_means(state, means), (jax.tree.map(present, z), u), k)
 
@@ -168,10 +182,15 @@ def scan_settled_rows(
     """Scan complete rows from a settled state with these means; return the last means, and what varies of each row.
 
     From row `count` on, behind the end of the data, the means stay.
+
+    Settled: covariances and gains stay as they are. `first`: number of the first row.
     """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Step over one row."""
+        """Step over one row; return the next means, and of what is kept the leaves that depend on data.
+
+        `settled`: the state whose covariances stay; `count`: number of the row at which the data end.
+        """
         data, k = row
         after, outputs = step_settled(recursion, settled.state, means, data, k)
         return select_state(k < count, means_of(after), means), settled.select_varying(outputs)
@@ -182,7 +201,10 @@ def scan_settled_rows(
 def sum_settled_rows(
     recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array, count: Array
 ) -> tuple[list[jax.Array], PyTree]:
-    """Scan complete rows as `scan_settled_rows` does; return the last means, and sums of all that is kept of a row."""
+    """Scan complete rows as `scan_settled_rows` does; return the last means, and sums of all that is kept of a row.
+
+    Settled: covariances and gains stay as they are. From row `count` on, behind the end of the data, nothing changes.
+    """
 
     def step(means: list[jax.Array], data: PyTree, k: Array) -> tuple[list[jax.Array], PyTree]:
         """Step over the complete row k from the settled state with these means; return the next means, and output."""
@@ -195,7 +217,10 @@ def sum_settled_rows(
 def means_after_settled_rows(
     recursion: Recursion, settled: SettledState, means: Sequence[Array], rows: PyTree, first: Array
 ) -> list[jax.Array]:
-    """Return the means after some complete rows, of which the first has the number `first`, and nothing of the rows."""
+    """Return the means after some complete rows, of which the first has the number `first`, and nothing of the rows.
+
+    Settled: covariances and gains stay as they are, and only means change.
+    """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], None]:
         """Step over one row."""
@@ -217,12 +242,16 @@ class CompleteBlocks(NamedTuple):
 
 
 def find_complete_blocks(z: PyTree, size: int) -> CompleteBlocks:
-    """Return which blocks of `size` rows of measurements (rows, ...) lack no number."""
+    """Return which blocks of `size` rows of measurements (rows, ...) lack no number.
+
+    Return the size, and how many of the first blocks are complete, block by block.
+    """
     total = len(jax.tree.leaves(z)[0])
     begin, complete = np.arange(0, total, size), np.ones(-(-total // size), bool)
     with np.errstate(over="ignore", invalid="ignore"):  # a sum of huge numbers is taken for one that lacks some
         for leaf in jax.tree.leaves(z):
             if leaf.size:
+                # A sum over a block is finite only if all of its numbers are.
                 complete &= np.isfinite(np.add.reduceat(leaf.reshape(-1), begin * (leaf.size // total)))
     return CompleteBlocks(size, np.append(0, np.cumsum(complete)))
 

@@ -113,13 +113,21 @@ class SmootherStep(Module):
         return settle(self.manifold, before, rts_step(self.before, unsettle(self.manifold, ahead, later)))
 
     def mean_back(self, later: jax.Array) -> jax.Array:
-        """Return the mean of the state before the step from that of the state after it, as `back` does."""
+        """Return the mean of the state before the step from that of the state after it, as `back` does.
+
+        `before.ahead`, `before.left.mean`: means after and before the step, about which the manifold takes attitudes as
+        small turns.
+        """
         before = self.before
         mean = before.mean_given(self.manifold.unsettle(before.ahead, later))
         return jnp.asarray(self.manifold.settle(before.left.mean, mean))
 
     def start(self) -> EarlierState:
-        """Return the state after this step as an earlier state that is yet to be carried ahead."""
+        """Return the state after this step as an earlier state that is yet to be carried ahead.
+
+        An earlier state is mean + link L^-1 (x - E x) + noise: here it is x itself, link and L are I and there is no
+        noise.
+        """
         n = len(self.after.mean)
         return EarlierState(
             mean=self.after.mean,
@@ -165,7 +173,11 @@ class SmootherStep(Module):
         return replace(self, after=self.after._replace(mean=mean_after), before=before)
 
     def estimate_from(self, law: Gaussian) -> Estimate:
-        """Return the estimate of the plant's state from the law of the filter's."""
+        """Return the estimate of the plant's state from the law of the filter's.
+
+        `projection`: from the filter's state to the plant's; `shift`: a mean that was subtracted; `limits`: of states,
+        within which the law is cut.
+        """
         mean, columns = law.mean, law.columns
         if self.projection is not None:
             mean, columns = self.projection @ mean, columns.through(self.projection)
@@ -221,6 +233,8 @@ def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
     """Return a filter's smoother step with the NIS of its innovation, under no stronger claim than the filter's own.
 
     A filter around another may hand on the smoother step of the filter within, and that filter's claim with it.
+
+    NIS: squared innovation over its covariance; `count`: how many numbers arrived.
     """
     step: SmootherStep = filter.smoother_step(trace)
     nis, count = innovation_distance(trace.innovation)

@@ -45,6 +45,8 @@ def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
 
     The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays.
 
+    A limit: the component's index, low and high end.
+
     Source: Simon, Kalman filtering with state constraints (2010), Section 2.4, with P^-1 as weight.
     """
     mean, covariance = x.mean, x.columns
@@ -63,6 +65,8 @@ def truncate_to_limits(x: Gaussian, limits: PlacedLimits) -> tuple[jax.Array, Ga
 
     Exact moments for one limited component; of several one after the other, each of the Gaussian of the moments after
     those before it: nominal where limited components are correlated.
+
+    A limit: the component's index, low and high end, either of which may be infinite.
 
     Source: Simon and Simon, Constrained Kalman filtering via density function truncation (2010).
     """

@@ -84,7 +84,10 @@ class AllReports(AbstractInformedFusion):
         return make_initial_belief(errors, 0, errors.bias.shape[1], quantized=False)
 
     def fuse_step(self, state: ReportsBelief, happened: CentreStep, means: Means) -> tuple[ReportsBelief, Fused]:
-        """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive."""
+        """Predict plant and all errors, then correct with the reports; one that is NaN did not arrive.
+
+        `means` (nodes, n): the estimates sent. Return the next state, and the fused mean and covariance.
+        """
         nodes, n = means.shape
         prior = propagate_errors(state, happened, make_lossless_links(nodes, n))
         # The means are the reports, all of age 0.
@@ -102,6 +105,9 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     """Return the state before the first report, for so many `delays` and `received` numbers per report.
 
     Every error is that of x_0 then, up to a constant; nothing has been sent.
+
+    `spill`: bound on the squared error by quantizers, None without. The state is (x, errors of the nodes, past
+    reports).
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
@@ -124,7 +130,10 @@ class ReportMap(NamedTuple):
     transition: ErrorMap
 
     def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
-        """Move zeta by its step, and past reports by one place."""
+        """Move zeta by its step, and past reports by one place.
+
+        zeta = (x, errors of the nodes); a report is x - e_i, and the past ones follow, the latest first.
+        """
         nodes, n, _ = self.transition.errors.shape
         zeta, past = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
         moved = self.transition @ zeta
@@ -198,9 +207,14 @@ def correct_with_reports(
 def _compute_gain(
     x: Gaussian, output: Float[jax.Array, "M N"], past: PastReports, present: Bool[jax.Array, " M"]
 ) -> Float[jax.Array, "N M"]:
-    """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report."""
+    """Return the gain of what arrived, with quantizers' errors and rounding as noise of each report.
+
+    x: state of the centre; `output`: reports by x; `past`: gain, offset, noise and quantizers' error of reports by age
+    and node.
+    """
     one, shape = np.eye(past.noise.shape[-1]), past.offset.shape
     terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
+    # Rounding to segments, uniform within -+ error, has the variance error^2 / 3.
     quantized = (past.gain * (past.error**2 / 3)[..., None, :]) @ past.gain.swapaxes(-1, -2)
     noise = past.noise + quantized + one * noise_beside_repeated(terms)[..., None]
     # What did not arrive has slopes of zero and a noise of its own.
@@ -211,7 +225,10 @@ def _compute_gain(
 
 
 def estimate_state(state: ReportsBelief, n: int) -> Fused:
-    """Return the estimate of x, with the covariance of its error or a bound on it."""
+    """Return the estimate of x, with the covariance of its error or a bound on it.
+
+    `spill`: bound on the squared error by quantizers, None without them.
+    """
     x = take_leading(state.gaussian, n)
     mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
     return mean, covariance if state.spill is None else _bound_by_young(covariance, state.spill[:n, :n])
@@ -241,6 +258,8 @@ def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N
 
     A report that was sent a steps before is its mean gain times x - e_i for a = 0, times what was sent then for a > 0.
     The reports (ages, nodes, m) are one below the other.
+
+    e_i: error of node i's estimate x - e_i, which is what a node sends.
     """
     ages, nodes, m, n = past.gain.shape
     size = nodes * n
@@ -253,7 +272,11 @@ def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N
 
 
 def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> WeightedColumns:
-    """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing."""
+    """Return the factors of K_i S_ij K_j', a column for each measurement; S_ij = 0 between nodes that share nothing.
+
+    K_i: gain of node i; S_ij: covariance of what nodes i and j receive, (node, m, m) where they share nothing, else
+    (node, m, node, m).
+    """
     nodes, _, m = gain.shape
     if noise.ndim == 3:
         received = _factor_each(jnp.asarray(noise)[None])
@@ -263,14 +286,20 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
-    """Return the factors of the covariance of noises that are independent of each other, of all reports together."""
+    """Return the factors of the covariance of noises that are independent of each other, of all reports together.
+
+    They are the factors of one block-diagonal covariance, age after age and node after node.
+    """
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))
     return WeightedColumns(_place_on_diagonal(blocks.matrix.reshape(noise.shape)), jnp.ravel(blocks.weights))
 
 
 def _place_on_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
-    """Return the block-diagonal matrix of these blocks."""
+    """Return the block-diagonal matrix of these blocks.
+
+    There is one block for each age and node, (a, b).
+    """
     ages, nodes, rows, columns = blocks.shape
     items = jnp.arange(ages * nodes)
     empty = jnp.zeros((len(items), rows, len(items), columns))
@@ -285,7 +314,10 @@ def _bound_by_cauchy(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"
 
 
 def _bound_by_young(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young)."""
+    """Return (1 + s / r) A + (1 + r / s) B >= E[(u + v)(u + v)'], of least trace: r^2 = tr A, s^2 = tr B (Young).
+
+    A and B bound E[u u'] and E[v v'], whatever the correlation of u and v.
+    """
     r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
     are_positive = (r > 0) & (s > 0)
     ratio = jnp.where(are_positive, s / jnp.where(r > 0, r, 1.0), 1.0)

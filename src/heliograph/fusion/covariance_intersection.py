@@ -27,6 +27,8 @@ def intersect_covariances(
 
     x_0 is the first of the means. Differences from it are used, since the matrices that multiply them have lost the
     digits that nearly dependent components cost: the means themselves may be millions of deviations from zero.
+
+    J: inverses of the covariances; w: weights of sum 1; x: the means.
     """
     covariance = invert_positive_definite(_sum_weighted(weights, information))
     differences = jnp.einsum("k,kab,kb->a", weights, information, means - means[0])
@@ -53,7 +55,11 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
     scaled = information / (jnp.sum(jax.vmap(jnp.trace)(information)) / count)
 
     def improve_weights(progress: _InteriorPointState) -> _InteriorPointState:
-        """Take one Newton step, unless the certificate says that the weights are good enough."""
+        """Take one Newton step, unless the certificate says that the weights are good enough.
+
+        w: weights, s = `slack`: multipliers of w >= 0; `scaled`: the information matrices J; P = (sum w J)^-1, g: the
+        trace's gradient. GAP: 1e-10, the relative excess allowed.
+        """
         w, slack = progress.weights, progress.slack
         trace, gradient, hessian = _trace_derivatives(scaled, w)
         # At the optimum s = g - min g: with a tenth of the trace added, the first multipliers are positive.
@@ -86,7 +92,10 @@ class _PointWithDerivatives(NamedTuple):
 def _trace_derivatives(
     information: Float[jax.Array, "count n n"], w: Float[jax.Array, " count"]
 ) -> tuple[Float[jax.Array, ""], Float[jax.Array, " count"], Float[jax.Array, "count count"]]:
-    """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
+    """Return tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1.
+
+    J: information matrices of the estimates; w: their weights.
+    """
     p = invert_positive_definite(_sum_weighted(w, information))
     half = information @ p  # J_k P
     full = p @ half
@@ -114,7 +123,11 @@ def _take_newton_step(point: _PointWithDerivatives) -> tuple[jax.Array, jax.Arra
     for_ones = root * solve(root[:, None])[:, 0]  # the solution for a right side of ones
 
     def find_moves(target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the moves of w and of s towards w s = target; m is such that the moves of w sum to 0."""
+        """Return the moves of w and of s towards w s = target; m is such that the moves of w sum to 0.
+
+        Closed over: weights w, their multipliers s (`slack`) and the trace's `gradient`; `root`, `solve`: scaling and
+        solution of Newton's equations, `for_ones` that for a target of ones, m the multiplier of the sum.
+        """
         solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
         move = solved - jnp.sum(solved) / jnp.sum(for_ones) * for_ones
         return move, (target - slack * move) / w - slack
@@ -164,7 +177,11 @@ def intersect_inverse_covariances(
         return invert_positive_definite(p_information + q_information - common), common
 
     def halve_interval(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there."""
+        """Return the half in which the slope changes its sign; its midpoint alone where the slope is flat there.
+
+        `ends`: of the interval of the weight w that is searched; p, q: the two covariances; FLAT: 1e-15, the share
+        below which a slope is rounding.
+        """
         low, high = ends
         w = jnp.mean(jnp.stack(ends))
         covariance, common = fuse_covariances(w)
@@ -195,6 +212,8 @@ def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Arr
     A component with less than KNOWN of its variance left, given those before it, gets KNOWN of it added; a component of
     variance zero gets KNOWN of the largest variance that any of the estimates has for it (1 where all are zero): the
     limit, to KNOWN of each component's scale, and never less.
+
+    KNOWN: 1e-8, the share of a variance that stands for none.
     """
     variances = jnp.diagonal(matrices, axis1=1, axis2=2)
     largest = jnp.max(variances, axis=0)
@@ -203,7 +222,10 @@ def invert_covariances(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Arr
 
 
 def _invert_widened(a: jax.Array, least: jax.Array) -> jax.Array:
-    """Invert a covariance whose variances are at least `least`."""
+    """Invert a covariance whose variances are at least `least`.
+
+    A component whose variance, given those before it, is below `least` gets that added.
+    """
     # 1 / root of the variance of each component given those before it; rounding where that is next to none.
     _, scales = factor(a)
     is_small = jnp.where((scales == 0) | (scales**2 * least > 1), 1.0, 0.0)

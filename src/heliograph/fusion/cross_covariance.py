@@ -55,7 +55,10 @@ class ErrorMap(NamedTuple):
     errors: Float[jax.Array, "node n n"]
 
     def __matmul__(self, columns: Float[Array, "N *columns"]) -> Float[jax.Array, "N *columns"]:
-        """Return F zeta of each column."""
+        """Return F zeta of each column.
+
+        zeta = (x, e_1, ..., e_nodes): the plant moves x; an error moves by itself, and by x under a wrong model.
+        """
         nodes, n, _ = self.errors.shape
         x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
         after = self.errors @ e + self.of_state @ x
@@ -77,7 +80,10 @@ class ErrorStep(NamedTuple):
     received: Array
 
     def noise(self) -> Float[jax.Array, "N N"]:
-        """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds."""
+        """Return B Q B' + K E[nu nu'] K', the covariance of what the step adds.
+
+        Q: process noise, nu: noise in what nodes receive, K: their gains. Nodes that share nothing have a block each.
+        """
         nodes, n, _ = self.gain.shape
         if self.received.ndim == 4:
             measured = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
@@ -129,7 +135,10 @@ class ErrorMoments(NamedTuple):
 def make_initial_errors(
     mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]
 ) -> ErrorMoments:
-    """Return the moments before the first step, when filters start at known means: errors are x_0 up to a constant."""
+    """Return the moments before the first step, when filters start at known means: errors are x_0 up to a constant.
+
+    The state x and all errors x - start have the covariance of x_0, and are fully correlated.
+    """
     mean, starts = jnp.asarray(mean), jnp.asarray(starts)
     return ErrorMoments(jnp.concatenate([mean[None], mean - starts]), jnp.tile(covariance, (1 + len(starts),) * 2))
 
@@ -158,13 +167,17 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
 def propagate_state(
     mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return E x and Cov x after the step."""
+    """Return E x and Cov x after a step x+ = matrix x + shift + w, Cov w = noise."""
     matrix = jnp.asarray(motion.matrix)
     return matrix @ mean + motion.shift, symmetric(propagate_by_mode(matrix, covariance, motion.noise))
 
 
 def propagate_errors_jointly(errors: ErrorMoments, step: ErrorStep) -> ErrorMoments:
-    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and the terms of a wrong model."""
+    """Propagate all pairs: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and the terms of a wrong model.
+
+    zeta = (x, e_1, ..., e_nodes) has the mean and covariance of `errors`; Q: process noise, S_ij: noise that nodes
+    share.
+    """
     mean = step.transition @ errors.mean.reshape(-1) + step.shift
     covariance = symmetric(propagate_by_mode(step.transition, errors.covariance, step.noise()))
     return ErrorMoments(mean.reshape(errors.mean.shape), covariance)
@@ -184,14 +197,20 @@ class ErrorSources(NamedTuple):
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:
-        """Return Cov(e_i, e_j) of all pairs."""
+        """Return Cov(e_i, e_j) of all pairs.
+
+        e_i is `shared`_i times common sources of variance 1, plus an own part of covariance `independent`_i.
+        """
         count, n, _ = self.shared.shape
         flat = self.shared.reshape(count * n, -1)
         blocks = np.eye(count)[:, None, :, None] * self.independent[:, :, None]
         return (flat @ flat.T).reshape(count, n, count, n) + blocks
 
     def weigh(self, weights: Float[Array, "n node n"]) -> tuple[Float[Array, "n sources"], Float[Array, "n n"]]:
-        """Return the sources of the sum W e, and the covariance of its independent part."""
+        """Return the sources of the sum W e, and the covariance of its independent part.
+
+        e_i is `shared`_i times common sources of variance 1, plus an own part of covariance `independent`_i.
+        """
         xp = library(weights, *self)
         independent = xp.einsum("aib,ibc,dic->ad", weights, self.independent, weights)
         return xp.tensordot(weights, self.shared, axes=2), independent
@@ -223,7 +242,11 @@ class SourceFactors(NamedTuple):
 
 
 def make_initial_factors(errors: ErrorMoments, sources: int) -> SourceFactors:
-    """Return the factors before the first step, with room for `sources` more: all is the deviation of x_0."""
+    """Return the factors before the first step, with room for `sources` more: all is the deviation of x_0.
+
+    zeta = (x, errors of nodes): each is its mean plus roots times the sources, which are independent numbers of
+    variance 1.
+    """
     nodes, n = errors.bias.shape
     state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.state_covariance))
     return SourceFactors(errors.mean, jnp.tile(state, (1 + nodes, 1)), jnp.zeros((nodes, n, n)))

@@ -12,6 +12,8 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
     linear in c: there the best single node is best. `levels` (N,) are the gamma_i.
 
+    A level gamma_i bounds a node's ratio of error to disturbance.
+
     Args:
         levels: gamma_i of the nodes (N,), positive.
 
@@ -30,6 +32,8 @@ def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"])
 
     The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level. `levels` (N,) are
     the gamma_i, `weights` (N,) the c_i.
+
+    A level bounds a node's ratio of error to disturbance, by norms.
 
     Args:
         levels: gamma_i of the nodes (N,), positive.

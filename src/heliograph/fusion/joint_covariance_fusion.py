@@ -97,7 +97,11 @@ class AbstractJointWeights(AbstractInformedFusion):
         raise unwritten(self, "arrived")
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'."""
+        """Return the weights of the neighbours' estimates that arrived, solved for these alone, and W P W'.
+
+        P: the joint covariance of the estimates' errors, W the weights. They are held as a front factor, here I, times
+        one part for each.
+        """
         if believed.joint is None or self.with_mean:
             raise fail(f"fusion by {type(self).__name__} between neighbours", "with_mean=False", True)
         weights = self.weights_of_arrived(believed.joint, believed.present)
@@ -106,7 +110,11 @@ class AbstractJointWeights(AbstractInformedFusion):
         )
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
-        """Fuse the present estimates with the best weights for their joint covariance."""
+        """Fuse the present estimates with the best weights for their joint covariance.
+
+        `errors`: bias and joint covariance of the nodes' errors; `with_mean`: the plant's mean before data is an
+        estimate too.
+        """
         errors = happened.errors
         unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
         if self.with_mean:
@@ -166,7 +174,11 @@ class DiagonalWeights(AbstractJointWeights):
         return solve_regularised_weights_by_component(joint, present)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices."""
+        """Return weights of the neighbours' estimates that arrived; of few neighbours without a product of matrices.
+
+        WRITTEN: most neighbours for which the solution is written out; weights are held as a front factor, here I,
+        times parts.
+        """
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
             return super().neighbour_weights(believed)
         diagonals = component_weights(believed.joint, believed.present)

@@ -23,11 +23,17 @@ Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
 def _with_joint_check(weights: Weights) -> Weights:
-    """Decorate weights so that they refuse an array that is no joint covariance."""
+    """Decorate weights so that they refuse an array that is no joint covariance.
+
+    It is Cov(e_i, e_j) of all nodes, of shape (nodes, n, nodes, n).
+    """
 
     @wraps(weights)
     def call(joint: Array, *rest: Array) -> Any:
-        """Check the joint covariance, then compute its weights."""
+        """Check the joint covariance, then compute its weights.
+
+        `weights`: the function of the joint covariance that is decorated.
+        """
         shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
         if len(shape) != 4 or shape[:2] != shape[2:]:
             raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or show_value(joint))
@@ -44,6 +50,8 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'. P^+ alone is wrong where a combination of the estimates
     has no error. With U = P + E D E', D > 0, the range of E is in that of U, and U gives the weights of P since W E is
     given. D is the mean of the estimates' variances, so units do not matter; one rank rule, on correlations.
+
+    RANK: units of rounding below which an eigenvalue is none.
 
     Args:
         joint: Cov(e_i, e_j) of all pairs, shape (node, n, node, n).
@@ -131,7 +139,10 @@ def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) 
 
 
 def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
-    """Return one number for each estimate: the weights of errors whose covariances are the traces."""
+    """Return one number for each estimate: the weights of errors whose covariances are the traces.
+
+    `joint` is Cov(e_i, e_j) of all estimates; its traces replace it, as of a state of one component.
+    """
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", joint)
     return jnp.einsum("i,ab->aib", weigh(traces.reshape(nodes, 1, nodes, 1))[0, :, 0], jnp.eye(n))
@@ -140,7 +151,10 @@ def _weigh_by_trace(weigh: Weights, joint: Float[jax.Array, "node n node n"]) ->
 def weigh_covariance(
     weights: Float[Array, "n node n"], joint: Float[Array, "node n node n"]
 ) -> Float[jax.Array, "n n"]:
-    """Return the covariance W P W' of the weighted sum of the errors."""
+    """Return the covariance W P W' of the weighted sum of the errors.
+
+    W are the weights, P = Cov(e_i, e_j) of all errors.
+    """
     return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))
 
 
@@ -171,7 +185,11 @@ def solve_regularised_weights(
 def solve_regularised_weights_by_component(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Return the diagonal weights of those that are present: the best for each component of the state by itself."""
+    """Return the diagonal weights of those that are present: the best for each component of the state by itself.
+
+    `joint`: Cov(e_i, e_j) of a node and its neighbours (degree of them). WRITTEN: most for which the solution is
+    written out.
+    """
     degree, n = joint.shape[:2]
     if degree <= WRITTEN:
         return jnp.einsum("ia,ab->aib", component_weights(joint, present), jnp.eye(n))
@@ -181,7 +199,11 @@ def solve_regularised_weights_by_component(
 def component_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "degree n"]:
-    """Return the diagonals c_i of the weights that are best for each component by itself."""
+    """Return the diagonals c_i of the weights that are best for each component by itself.
+
+    `joint`: Cov(e_i, e_j) of a node and its neighbours (degree of them); `present`: which arrived; weights of absent
+    ones are 0.
+    """
     component = jnp.stack([joint[:, a, :, a] for a in range(joint.shape[1])])
     return jax.vmap(_weigh_component, in_axes=(0, None), out_axes=1)(component, present.astype(joint.dtype))
 
@@ -189,7 +211,10 @@ def component_weights(
 def _weigh_component(
     joint: Float[jax.Array, "degree degree"], arrived: Float[jax.Array, " degree"]
 ) -> Float[jax.Array, " degree"]:
-    """Return c = U^-1 1 / 1' U^-1 1 over those that arrived (1, else 0), as `solve_regularised_weights` of n = 1."""
+    """Return c = U^-1 1 / 1' U^-1 1 over those that arrived (1, else 0), as `solve_regularised_weights` of n = 1.
+
+    U = P + ridge: P the joint covariance of one component, RIDGE: 1e-8 of the mean variance, so that U is regular.
+    """
     mean = jnp.sum(arrived * jnp.diagonal(joint)) / jnp.sum(arrived)
     # What U adds to P; the rows of absent estimates are those of I.
     ridge = jnp.where(arrived > 0, RIDGE * jnp.where(mean > 0, mean, 1.0), 1.0)
@@ -200,7 +225,10 @@ def _weigh_component(
 def weigh_covariance_by_component(
     weights: Float[jax.Array, "degree n"], joint: Float[jax.Array, "degree n degree n"]
 ) -> Float[jax.Array, "n n"]:
-    """Return the covariance C P C' of diagonal weights, a sum over senders at a time."""
+    """Return the covariance C P C' of diagonal weights, a sum over senders at a time.
+
+    C: weights (degree, n) of the estimates by component, P = `joint`: Cov(e_i, e_j) of all of them.
+    """
     sums = jnp.einsum("iajb,jb->iab", joint, weights)
     return symmetric(jnp.einsum("ia,iab->ab", weights, sums))
 
@@ -208,5 +236,8 @@ def weigh_covariance_by_component(
 def solve_regularised_scalar_weights(
     joint: Float[jax.Array, "degree n degree n"], present: Bool[jax.Array, " degree"]
 ) -> Float[jax.Array, "n degree n"]:
-    """Return weights of one number for each estimate that is present, of least trace."""
+    """Return weights of one number for each estimate that is present, of least trace.
+
+    `joint`: Cov(e_i, e_j) of the estimates of a node and its neighbours, of whose fused error the trace is least.
+    """
     return _weigh_by_trace(partial(solve_regularised_weights, present=present), joint)

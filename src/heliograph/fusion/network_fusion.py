@@ -128,7 +128,10 @@ class Fusion(Module):
         return None if self.quantizer is None else stack(self._quantizers(nodes))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Return the claim of the fused covariance, from the claims of the filters."""
+        """Return the claim of the fused covariance, from the claims of the filters.
+
+        `quantizer`: None without; else one for all nodes, or one for each, by name.
+        """
         if self.quantizer is None:
             return self.rule.claim(claims)
         # All are of one kind, and that alone decides the claim.

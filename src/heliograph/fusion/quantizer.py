@@ -97,6 +97,8 @@ def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "
     With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So
     E[(x - q)(x - q)'] <= (1 + t) P + (1 + 1/t) s diag(D) for every t > 0, with the smallest trace (r + s)^2 at
     t = s / r, r = sqrt(tr P): then it is (1 + s / r) P + (r + s) diag(D). NaN where D is.
+
+    q: the quantized estimate, xhat: the estimate, D: bounds of the quantizer's error (n,).
     """
     s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
     share = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
@@ -145,7 +147,7 @@ def check_amplitude(name: str, amplitude: Parameter, scale: Parameter, levels: F
     if is_traced(amplitude, scale):
         return
     with np.errstate(over="ignore", under="ignore"):
-        largest = np.asarray(amplitude) * scale
+        largest = np.asarray(amplitude) * scale  # in the unit of x
         in_range = np.isfinite(largest) & (largest / levels >= np.finfo(np.float64).tiny)
     if not np.all(in_range):
         least = np.finfo(np.float64).tiny * float(levels)
@@ -176,6 +178,7 @@ class UniformQuantizer(AbstractQuantizer):
     scale: Parameter
 
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
+        """Keep the number of segments, the amplitude of what is quantized, and the scale that divides it."""
         self.levels = check_levels(levels)
         self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
         check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
@@ -191,7 +194,7 @@ class UniformQuantizer(AbstractQuantizer):
         return state, _quantize_uniformly(x, self.amplitude, self.levels, self.scale)
 
     def error(self, n: int) -> Float[Array, " n"]:
-        """Return half of a segment's length."""
+        """Return half of a segment's length for each component: the largest error within the range."""
         half = self.scale * self.amplitude / self.levels
         bound: Float[Array, " n"] = library(half).broadcast_to(half, (n,))
         return bound

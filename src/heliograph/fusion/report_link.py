@@ -49,6 +49,7 @@ class EventSending(AbstractQuantizer):
     announced: bool = eqx.field(static=True, default=True)
 
     def __init__(self, threshold: Float[ArrayLike, "*n"], announced: bool = True):
+        """Keep the change beyond which a value is sent, and whether the receiver knows it, so that silence tells."""
         self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)
@@ -71,7 +72,11 @@ class EventSending(AbstractQuantizer):
 
     @in_float64
     def step(self, state: LastSent, value: ArrayLike) -> tuple[LastSent, Quantized]:
-        """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss."""
+        """Send or stay silent; return what the receiver has after this step, NaN where it takes silence for a loss.
+
+        A value is sent if a component differs from the last sent one by more than its threshold. `announced`: the
+        receiver knows that silence means no change. Symbols: 1 per component sent, else 0.
+        """
         x = jnp.asarray(fill_masked(value), dtype=float)
         is_value = ~jnp.any(jnp.isnan(x))
         sent = is_value & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
@@ -160,6 +165,7 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
             raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
         # It raises where its error has no bound before any data.
         quantizer.error(n)
+        # A quantizer that holds sends nothing while its value stays, so that silence must be no loss.
         if quantizer.holds and not link.delivers(n):
             raise fail(f"reports through {type(quantizer).__name__}, whose silence is understood", "a report link "
                        "that loses, changes and delays by chance nothing that is sent", "another")  # fmt: skip

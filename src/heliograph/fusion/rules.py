@@ -66,7 +66,10 @@ class AbstractFusion(Module):
 
     @property
     def between_neighbours(self) -> bool:
-        """True if it fuses what arrived from neighbours too."""
+        """True if it fuses what arrived from neighbours too.
+
+        So it is where its class has weights or gains of neighbours of its own.
+        """
         this = type(self)
         return (this.neighbour_weights, this.neighbour_gains) != (
             AbstractFusion.neighbour_weights, AbstractFusion.neighbour_gains
@@ -145,7 +148,7 @@ class AbstractIntersection(AbstractFusion):
         raise unwritten(self, "weights_of")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Find the weights and intersect."""
+        """Find the weights of the estimates by their covariances and intersect them."""
         information = invert_covariances(covariances)
         mean, covariance = intersect_covariances(means, information, self.weights_of(covariances, information))
         return restore_exact_components(mean, covariance, means, covariances)
@@ -259,7 +262,7 @@ class InverseCovarianceIntersection(AbstractFusion):
         return _combine_claims(claims, "nominal")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Fuse the first two, the result with the third, and so on."""
+        """Fuse the first two by inverse covariance intersection, the result with the third, and so on."""
         mean, covariance = means[0], covariances[0]
         for other, other_covariance in zip(means[1:], covariances[1:], strict=True):
             mean, covariance = intersect_inverse_covariances(mean, covariance, other, other_covariance)
@@ -267,7 +270,10 @@ class InverseCovarianceIntersection(AbstractFusion):
 
 
 def _combine_claims(claims: list[Claim], strongest: Claim) -> Claim:
-    """Return the weakest claim, for rules whose weights come from covariances."""
+    """Return the weakest claim, for rules whose weights come from covariances.
+
+    `strongest`: the strongest claim of the rule itself.
+    """
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
     return weakest([*claims, strongest])

@@ -83,7 +83,11 @@ class SplitIntersection(AbstractIntersection):
             return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
         def improve_shares(_: int, shares: jax.Array) -> jax.Array:
-            """Return the best shares for the weights that are the best for these shares; none is below LEAST."""
+            """Return the best shares for the weights that are the best for these shares; none is below LEAST.
+
+            Shares: of each estimate in the bound of the joint covariance, whose `unknown` parts are divided by them;
+            LEAST: 1e-12.
+            """
             weights = matrix_weights(bound_joint(shares))
             root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
             total = root.sum()  # 0 where nothing is unknown: then the shares do not matter
@@ -103,6 +107,8 @@ def _add_rounding(unknown: jax.Array, covariances: jax.Array) -> jax.Array:
     """Return parts P^b_i = P_i - P^a_ii with the rounding of P_i, of which they are known; one that is 0 stays so.
 
     A share may be small: divided by it, an eps of P_i that is missing would be much of the bound.
+
+    P_i: covariance of estimate i; P^a: the part of known correlation; P^b: that of unknown correlation.
     """
     n = unknown.shape[-1]
     rounding = rounding_of_variances(jnp.einsum("aii->ai", covariances), n)

@@ -127,7 +127,10 @@ def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFind
 
 
 def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
-    """Return reasons against a certificate: refuted constants, and findings about constants above the system's."""
+    """Return reasons against a certificate: refuted constants, and findings about constants above the system's.
+
+    `growth`: constants a of |f(x)| <= a |x| and of differences; `findings`: what checks of these constants found.
+    """
     reasons, constants = [], _list_positive(growth.state) + _list_positive(growth.error)
     for finding in findings:
         if finding.refuted:
@@ -152,6 +155,9 @@ def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[Grow
     """List a function's constants that no finding proves.
 
     A bound of the slopes in a box bounds differences in it, and with f(0) = 0 and 0 in the box the function itself.
+
+    `growth.state`, `growth.error`: the constants of f itself and of its differences; `around_zero`: 0 is in the
+    finding's box.
     """
     around_zero = [finding for finding in findings if finding.around_zero]
     itself, differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
@@ -170,7 +176,10 @@ def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[Grow
 def _list_wrong_signs(
     weights: Float[np.ndarray, "times w w"], multipliers: Float[np.ndarray, "steps count"]
 ) -> list[str]:
-    """Return in words which weights P_k are not positive definite, and which steps have a negative multiplier."""
+    """Return in words which weights P_k are not positive definite, and which steps have a negative multiplier.
+
+    ROUNDING: 1e-12, up to which an eigenvalue has no sign.
+    """
     smallest = np.array([smallest_eigenvalue(p) for p in weights])
     not_definite = np.flatnonzero(~(smallest > ROUNDING))
     reasons = [f"P_{k} is not positive definite ({smallest[k]:.3g})" for k in not_definite]
@@ -213,7 +222,10 @@ def make_theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
-        """Return rows over eta that multiply its parts by these blocks, by the letter of the part."""
+        """Return rows over eta that multiply its parts by these blocks, by the letter of the part.
+
+        eta: vector of all that a step depends on, q long; `at`: first place of each part in it, by letter.
+        """
         wide = np.zeros((height, q))
         for name, block in blocks.items():
             wide[:, at[name] : at[name] + block.shape[1]] = block
@@ -279,6 +291,8 @@ def _drop_absent_functions(
     """Return Phi without f and f~, or h and h~, where the function is zero throughout.
 
     at: the first row of each part of eta; f~ stands behind f, and h~ behind h.
+
+    Phi is the quadratic form of a step in eta = (x, e, f, f~, h, h~, v, rho); `y`: length of h; f~, h~: differences.
     """
     kept = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
@@ -288,7 +302,10 @@ def _drop_absent_functions(
 
 
 def _complete_multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
-    """Return the multipliers of f, f~, h, h~ from 2 or 4 for each step."""
+    """Return the multipliers of f, f~, h, h~ from 2 or 4 for each step.
+
+    2: one for (f, f~) and one for (h, h~), each of which counts for both.
+    """
     if given.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", given.shape[1])
     return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
@@ -308,7 +325,10 @@ def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
 
 
 def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Return the largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative."""
+    """Return the largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative.
+
+    Its sign is that of Phi's own, and it does not depend on units.
+    """
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):
         return np.inf

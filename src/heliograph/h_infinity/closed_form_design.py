@@ -125,6 +125,8 @@ def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[f
 
     |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do, and
     d = SPARE leaves a part of it for the multipliers.
+
+    a, b: growth constants of f and h, |f(x)| <= a |x|; `state`: the present weight; f = 0 has any multiplier.
     """
     size, a, b = np.linalg.norm(system.transition[k], 2), system.growth.state[k], system.output_growth.state[k]
     next_state = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))

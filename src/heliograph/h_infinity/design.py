@@ -195,6 +195,9 @@ def _find_first_failing(
     """Return the number of the first step whose inequality a solution does not satisfy; None where all hold.
 
     solved: each step's unknowns; weights: P before each step, in scaled coordinates; square: the level squared.
+
+    SCREEN: strictness that must be left, relative to the level squared. `fixed`: the part of the inequality without
+    unknowns.
     """
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
@@ -208,6 +211,7 @@ class _RecursiveDesigner:
     """Recursive design over the horizon: one problem a step, compiled again only where the system's data change."""
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
+        """Keep the system with its steps in scaled coordinates, and a list of the problems compiled so far."""
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
         self.steps, self.coordinates = scale_steps(system, list_step_matrices(system, separate))
         self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
@@ -255,6 +259,8 @@ class _RecursiveDesigner:
         """Return the problem of step k, the one compiled before where its matrices and sizes are the same.
 
         A weight `start` that couples x and e makes a problem of its own.
+
+        `sizes`: scales of x and e before the next step; a weight is P of (x, e).
         """
         step, sizes = self.steps[k], self.coordinates.relative_scales(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
@@ -283,6 +289,9 @@ def _inequality_holds(
     """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
 
     fixed: the part of Phi without unknowns, S - diag(P, 0).
+
+    P1, P2 (`state`, `error`): next weights; K: gain; Phi: the matrix of the step's inequality in eta, S - diag(P, 0)
+    without unknowns.
     """
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
@@ -302,7 +311,10 @@ def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
 
 
 def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
-    """Return a design that is not feasible, whose arrays are NaN, with the solver's status."""
+    """Return a design that is not feasible, whose arrays are NaN, with the solver's status.
+
+    `separate`: one multiplier for each of four functions, else one for each two.
+    """
     n, steps = system.states, system.steps
     return HInfinityDesign(
         level=level,

@@ -149,6 +149,7 @@ def _repeat_over(
         return np.broadcast_to(matrix, (steps, *matrix.shape))
     if value.steps < steps:
         raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
+    # More steps than asked for are left out.
     matrices: np.ndarray = array(name, value.values, (None, *shape))
     return matrices[:steps]
 
@@ -172,7 +173,10 @@ def _compute_link_moments(steps: int, channel: Channel) -> tuple[DisturbedGain, 
 
 
 def _check_growth(steps: int, name: str, value: Constants) -> Growth:
-    """Return the growth constants at every step from a number, or from a pair (of the function, of its differences)."""
+    """Return the growth constants at every step from a number, or from a pair (of the function, of its differences).
+
+    A constant a says |f(x)| <= a |x|, or |f(x) - f(y)| <= a |x - y|; one number stands for both.
+    """
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
@@ -184,7 +188,10 @@ def _check_growth(steps: int, name: str, value: Constants) -> Growth:
 
 
 def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
-    """Return the initial weight (2n, 2n) from a number or a positive definite matrix."""
+    """Return the initial weight (2n, 2n) from a number or a positive definite matrix.
+
+    It is the weight of (x, e), the first state and error of n components each; a number stands for that times I.
+    """
     name, size = "initial weight", 2 * n
     single = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
@@ -197,7 +204,10 @@ def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
 
 
 def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
-    """Return a matrix made exactly symmetric; ValueError unless it is nearly so, with entries of at most LARGEST."""
+    """Return a matrix made exactly symmetric; ValueError unless it is nearly so, with entries of at most LARGEST.
+
+    SYMMETRY_TOLERANCE: largest difference across the diagonal, in units of each component; LARGEST: 1e100.
+    """
     largest = float(np.max(np.abs(matrix), initial=0.0))
     if largest > LARGEST:
         raise fail(name, f"entries of at most {LARGEST:g}", f"{largest:g}")

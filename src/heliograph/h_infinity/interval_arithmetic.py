@@ -133,7 +133,10 @@ def _apply_operation(equation: Any, x: list[Interval], continuous: bool) -> Inte
 
 
 def _check_decided(interval: Interval, continuous: bool) -> Interval:
-    """Return the interval of a decision, refused where it is open and the function has to be continuous."""
+    """Return the interval of a decision, refused where it is open and the function has to be continuous.
+
+    Equal ends are a decision that is the same in the whole region; False and True are an open one.
+    """
     if continuous and not np.array_equal(interval.low, interval.high):
         raise NoIntervalError("a decision that depends on where in the region x is")
     return interval
@@ -143,6 +146,8 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
     """Return the intervals of numbers that an operation only moves: of low ends, and of high ends.
 
     Whole numbers among its arguments are places, which have to be certain.
+
+    `equation`: the operation of a traced program, such as a reshape or a look-up.
     """
     if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
         raise NoIntervalError("a place that depends on x")
@@ -175,6 +180,8 @@ def _select_case(x: list[Interval]) -> Interval:
     """Return the interval of cases[which], x = [which, *cases].
 
     Where `which` is open, from the lowest of the possible cases to the highest.
+
+    `which`: interval of a whole number; open where its ends differ.
     """
     which, cases = x[0], x[1:]
     lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
@@ -198,6 +205,7 @@ def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
 def _bound_quotient(a: Interval, b: Interval) -> Interval:
     """Return an interval of x / y; all numbers where y may be 0."""
     holds_zero = (b.low <= 0) & (b.high >= 0)
+    # A divisor of 1 where 0 is possible: what is computed there is not used.
     safe = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
     ends = [x / y for x in a for y in safe]
     low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
@@ -212,7 +220,10 @@ def _bound_square(a: Interval) -> Interval:
 
 
 def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
-    """Return an interval of x^k for a whole number k."""
+    """Return an interval of x^k for a whole number k.
+
+    ULPS: units in the last place by which a power may be off. Even powers depend on |x| alone.
+    """
     if exponent < 0:
         return _bound_quotient(point_interval(np.ones_like(a.low)), _raise_interval_to_power(a, -exponent))
     if exponent % 2 == 0:
@@ -234,14 +245,17 @@ def _make_monotone_bound(
 
     def call(a: Interval) -> Interval:
         """Return the interval of the function's values on an interval of its argument."""
-        values = round_outward(function(a.low), function(a.high), ULPS)
+        values = round_outward(function(a.low), function(a.high), ULPS)  # ULPS: error of a library's function
         return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
     return call
 
 
 def _bound_cosine(a: Interval) -> Interval:
-    """Return the interval of cos: up to 1 if an even multiple of pi is inside, down to -1 if an odd one is."""
+    """Return the interval of cos: up to 1 if an even multiple of pi is inside, down to -1 if an odd one is.
+
+    ULPS: units in the last place by which a library's cosine may be off.
+    """
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     # Ends in multiples of pi, widened by more than their rounding.
@@ -273,7 +287,11 @@ def _bound_contraction(a: Interval, b: Interval, dimensions: Contraction) -> Int
     (left, right), (left_batch, right_batch) = dimensions
 
     def lay_out(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:
-        """Return x with axes (batch, `before` ones, free, `after` ones, contracted), so that both factors broadcast."""
+        """Return x with axes (batch, `before` ones, free, `after` ones, contracted), so that both factors broadcast.
+
+        Batch axes are common to both factors, free ones of one alone, contracted ones are summed over; ones: of length
+        1.
+        """
         free = [i for i in range(x.ndim) if i not in contracted and i not in batch]
         batch_sizes, free_sizes, contracted_sizes = ([x.shape[i] for i in axes] for axes in (batch, free, contracted))
         x = np.transpose(x, [*batch, *free, *contracted])

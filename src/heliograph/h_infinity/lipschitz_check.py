@@ -102,7 +102,7 @@ class GrowthFinding(NamedTuple):
         return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
 
     def _describe_evidence(self) -> str:
-        """Return in words what refutes the constant: f(0), the slope at a point, or the ratio of a pair."""
+        """Return in words what refutes the constant: f(0), the slope at a point, or the ratio |df| / |dx| of a pair."""
         if not self.starts_at_zero:
             return f"f(0) has the norm {self.at_zero:.6g}, not 0"
         if self.ratio <= self.limit:
@@ -185,6 +185,7 @@ class _LipschitzMeter:
     """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
 
     def __init__(self, function: Function, width: float):
+        """Compile the function and its Jacobian; `width`: of the region, against which points are near each other."""
         self.width, self.function = width, function
         self.jacobian = _compile_by_part(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
@@ -204,7 +205,7 @@ class _LipschitzMeter:
         """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
-        apart = distance > NEARBY * self.width / 2
+        apart = distance > NEARBY * self.width / 2  # NEARBY: 1e-4
         change = np.linalg.norm(np.asarray(self.values(x)) - self.values(y), axis=1)
         return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
 
@@ -238,11 +239,11 @@ def _search_slopes_and_pairs(
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of points, compiled for as many at a time as a climb tries, so that it is one program."""
+    """Return a function of points, compiled for CLIMBERS * TRIALS (as many as a climb tries) at a time."""
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
-        """Compute part by part, the last one padded by repetition of the last point."""
+        """Compute as many points at a time as the program takes, with copies of the last one to fill up."""
         size = CLIMBERS * TRIALS
         padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
         values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]
@@ -393,6 +394,6 @@ def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2
-    left, right = high.copy(), low.copy()
+    left, right = high.copy(), low.copy()  # high ends of the left, low of the right
     left[rows, sides] = right[rows, sides] = middle
     return np.concatenate([low, right]), np.concatenate([left, high])

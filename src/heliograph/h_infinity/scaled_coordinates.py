@@ -33,6 +33,8 @@ class ScaledCoordinates(NamedTuple):
 
         (1, 1) where nothing grows: S1 and S2 are matrices then, else multiples of the identity, since growth compares
         norms of x and e.
+
+        S1, S2: scales of x and e; growth: bounds such as |f(x)| <= a |x|.
         """
         if self.nothing_grows:
             return 1.0, 1.0
@@ -116,6 +118,9 @@ def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> F
     """Return scales diag(S1, S2) of x and e from their covariances.
 
     Factors of the covariances where nothing grows; else a number for each, since growth is a ratio of norms.
+
+    x: state, e: error. "Growth" are bounds such as |f(x)| <= a |x|, which keep their meaning under multiples of I
+    alone.
     """
     if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
@@ -124,7 +129,10 @@ def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> F
 
 
 def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the lower factor of a covariance with a little variance added, for a state that is never disturbed."""
+    """Return the lower factor of a covariance with a little variance added, for a state that is never disturbed.
+
+    SMALLEST: 1e-6 of each deviation. Units are powers of four, by which scaling has no rounding.
+    """
     unit = _powers_of_four_near(np.sqrt(np.diagonal(covariance)))
     return np.asarray(
         unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
@@ -185,13 +193,19 @@ def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: 
     """Return the last step's gain K0 where it loses little against the best K, else K.
 
     It adds (K - K0) R (K - K0)' to the covariance `after` the correction, R the received covariance.
+
+    CONVERGED: 0.1, the share of each variance that it may add. A gain that stays makes steps alike, compiled once.
     """
     more = (last - best) @ received @ (last - best).T
     return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
 
 
 def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
-    """Return the scales T of eta = T times what is of order one, from those of (x, e) before the step."""
+    """Return the scales T of eta = T times what is of order one, from those of (x, e) before the step.
+
+    eta = (x, e, f, f~, h, h~, disturbances); f is as large as its growth constant times x, f~ as that times e;
+    disturbances are of order one.
+    """
     n, y = system.states, system.output.shape[1]
     parts = [sizes]
     for growth, width in ((system.growth, n), (system.output_growth, y)):

@@ -44,14 +44,20 @@ def import_cvxpy() -> ModuleType:
 
 
 def check_choice(name: str, value: str, choices: Any) -> None:
-    """Raise ValueError unless `value` is among the choices of an alias of a Literal."""
+    """Raise ValueError unless `value` is among the choices of an alias of a Literal.
+
+    `choices`: a type alias, such as `type Solver = Literal["clarabel", "scs"]`.
+    """
     known = get_args(choices.__value__)
     if not isinstance(value, str) or value not in known:
         raise fail(name, f"one of {', '.join(known)}", show_value(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:
-    """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too."""
+    """Solve a problem and return its status; a solver that gives up or is not sure of its answer is a status too.
+
+    SCS_ACCURACY, SCS_ITERATIONS: accuracy (finer than its own) and most iterations of the solver SCS.
+    """
     cp = import_cvxpy()
     solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
@@ -122,6 +128,9 @@ class StepProblem:
         """Return the constraints Phi < 0 of each part of eta that is coupled, multipliers >= 0, and positive matrices.
 
         Matrices that must be positive definite are linear in the unknowns, such as [[Z, Y'], [Y, P2]].
+
+        Phi: matrix of the step's inequality in eta, q square; Y = P2 K, Z >= K'P2 K; MARGIN: by how much a matrix must
+        be definite; `forms`: the linear maps from unknowns to matrices.
         """
         q, layout = len(step.energy), self.layout
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
@@ -286,7 +295,10 @@ class HorizonProblem:
             )
 
     def _require_semidefinite(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite."""
+        """Require sum_i blocks_i (unknowns in place i) + constant, a matrix row by row, to be positive semidefinite.
+
+        `places`: where each group of unknowns lies in their vector.
+        """
         # One sparse matrix of all unknowns.
         values, rows, columns = [], [], []
         for index, block in blocks.items():

@@ -55,6 +55,8 @@ def list_step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrice
     """Return the matrices of every step; a function that is zero throughout, as a linear h, is left out of eta.
 
     `separate`: one multiplier for each of f, f~, h, h~ in place of one for (f, f~) and one for (h, h~).
+
+    eta: vector of all that a step depends on; U_j: matrices of the random part of what is received.
     """
     # The U_j of every step, as many at each: zeros where there are fewer.
     spreads = [link.spreads() for link in system.channel]
@@ -69,6 +71,8 @@ def complete_multipliers(
     """Return all multipliers, zeros for functions that were left out: (steps, 4) for f, f~, h, h~, or (steps, 2).
 
     separate: whether there is one for each of the four, or one for (f, f~) and one for (h, h~).
+
+    f~, h~: differences of f and h at the state and its estimate; a function is absent if it is zero throughout.
     """
     items = 2 if separate else 1
     present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(items)]
@@ -135,7 +139,11 @@ class _PartsOfEta(NamedTuple):
 
 
 def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
-    """Return the place of each part of eta at step k."""
+    """Return the place of each part of eta at step k.
+
+    They are x, e, f, f~, h, h~, the plant's disturbance and the channel's; a function that is zero throughout has no
+    place.
+    """
     n, y = system.states, system.output.shape[1]
     f, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
     sizes = [n, n, f, f, h, h, system.disturbance.shape[2], system.channel[k].disturbances]
@@ -149,6 +157,8 @@ def _list_growth_forms(
     """Return the diagonals of the growth forms of step k, one for each multiplier.
 
     Conditions |value| <= constant |argument| on f and f~, on h and h~; `separate`: each has a multiplier of its own.
+
+    q: length of eta; f~, h~ (`f_error`, `h_error`): differences of f and h.
     """
     growth, output_growth = system.growth, system.output_growth
     pairs = []
@@ -162,7 +172,10 @@ def _list_growth_forms(
 
 
 def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
-    """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
+    """Return sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta.
+
+    It is not negative where each |value_i| <= a_i |argument_i|; `parts`: places of value and argument in eta, and a_i.
+    """
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
         diagonal[value] -= 1.0
@@ -171,7 +184,10 @@ def _make_growth_form(q: int, parts: list[tuple[slice, slice, float]]) -> Float[
 
 
 def compute_next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
-    """Return the quadratic form E[next weight of (x+, e+)] + sum_i lambda_i N_i of eta, linear in the unknowns."""
+    """Return the quadratic form E[next weight of (x+, e+)] + sum_i lambda_i N_i of eta, linear in the unknowns.
+
+    N_i: growth forms with multipliers lambda_i; X, E, U: x+, e+ and received by eta; P1, P2: next weights; Y = P2 K.
+    """
     X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
@@ -196,7 +212,10 @@ class UnknownsLayout(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Length of the vector of all unknowns."""
+        """Length of the vector of all unknowns.
+
+        Triangles of two weights (n, n), the gain's unknowns unless it is given, and multipliers.
+        """
         n, m = self.states, self.received
         free = n * m + m * (m + 1) // 2 if self.gain is None else 0
         return n * (n + 1) + free + self.multipliers
@@ -205,6 +224,8 @@ class UnknownsLayout(NamedTuple):
         """Return the unknowns: triangles of P1 and P2, then Y and a triangle of Z, then the multipliers.
 
         With a given gain Y = P2 K and Z = K'P2 K follow, and are not in the vector.
+
+        P1, P2: next weights of state and error, K: gain.
         """
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
@@ -220,7 +241,10 @@ class UnknownsLayout(NamedTuple):
 
 
 def _mirror_lower_triangle(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
-    """Return the symmetric matrix (n, n) of the entries of its lower triangle."""
+    """Return the symmetric matrix (n, n) of the entries of its lower triangle.
+
+    `entries`: row after row, as `_triangle_places` lists them.
+    """
     matrix = np.zeros((n, n))
     rows, columns = _triangle_places(n)
     matrix[rows, columns] = matrix[columns, rows] = entries
@@ -245,7 +269,11 @@ class LinearForms(NamedTuple):
 
 
 def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms:
-    """Return the linear forms of a step, whose columns are their values at the unit vectors of the unknowns."""
+    """Return the linear forms of a step, whose columns are their values at the unit vectors of the unknowns.
+
+    Forms: Phi's part with unknowns, matrices that must be positive, and the next weight, row by row. `layout.gain`: a
+    gain that is given, None where it is unknown.
+    """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     forward = np.array([compute_next_energy(step, u).ravel() for u in units]).T
     positive = [np.array([u.state.ravel() for u in units]).T]
@@ -259,7 +287,10 @@ def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms
 
 
 def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
-    """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row."""
+    """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row.
+
+    P1, P2: weights of state and error after the step.
+    """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
@@ -271,6 +302,8 @@ def find_independent_parts(
     """Return the index sets of eta that Phi never couples: a smaller inequality for each says the same.
 
     `start`: the weight before the step, where it is not diag(P1, P2).
+
+    Phi: matrix of the step's inequality in eta, q long, which begins with x and e of n components each.
     """
     q = len(step.energy)
     coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)

@@ -75,7 +75,7 @@ class EventFilter(AbstractSizedFilter):
         return self.loses and self.trigger.reference == "sent"
 
     def with_room_for_heartbeats_of(self, others: Sequence[AbstractFilter]) -> "EventFilter":
-        """Return the filter with room for the longest heartbeat of others that have one."""
+        """Return the filter with room for the longest heartbeat (steps after which one must send) of the others."""
         ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
         if self.trigger.heartbeat is None or ages <= self.ages:
             return self
@@ -96,7 +96,7 @@ class EventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> EventBelief:
-        """Return the prior, and no reference yet."""
+        """Return the prior of (x, r), x the plant's state and r the reference of the sender: none was sent yet."""
         start, m = at(self.plant, 0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
         both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), WeightedColumns(np.eye(m), jnp.zeros(m)))
@@ -121,7 +121,7 @@ class EventFilter(AbstractSizedFilter):
     @property
     def _known_reference_count(self) -> int:
         """Number of Gaussians of known reference: pieces of the region, and of its outside if a loss may hide there."""
-        if not self.loses or self.reference_may_be_lost:
+        if not self.loses or self.reference_may_be_lost:  # loses: transmissions may be lost
             return self.known
         return self.known + self.region.count_outside_parts(self.senders[0])
 
@@ -186,7 +186,7 @@ class EventFilter(AbstractSizedFilter):
         """
 
         def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Update by silence; no value is expected."""
+            """Update by silence of sender s; no value is expected: zeros in place of its mean and covariance."""
             return (
                 self._condition_on_silence(augmented, channel, lost, s, begun),
                 jnp.zeros_like(z),
@@ -232,7 +232,7 @@ class EventFilter(AbstractSizedFilter):
         return self._restore_if_impossible(truncate(augmented, s, SilenceByCause(unsent, dropped, forced)), augmented)
 
     def _truncate_with_known_reference(self, augmented: GaussianSum, s: int, labels: SilenceByCause) -> GaussianSum:
-        """Return the sum over (x, r) given silence of sender s, where r is known however many values were lost.
+        """Return the sum over (x, r) given silence of sender s, r the value that it compares y with, known here.
 
         Every Gaussian is cut to each piece of |y - r| <= delta, and of |y - r| > delta if values may be lost; those of
         the same piece are joined.
@@ -334,15 +334,16 @@ class EventFilter(AbstractSizedFilter):
         """
         waiting, due = self._split_label_by_sending(used.label[:, s], begun)
         event = used.relabel_sender(s, waiting)
-        outside = self.region.truncate_outside(event, self.senders[s], 1 - RIM)
+        outside = self.region.truncate_outside(event, self.senders[s], 1 - RIM)  # RIM: for rounding
         mass = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0)
-        lowest = event.log_weight + np.log(FLOOR)
+        lowest = event.log_weight + np.log(FLOOR)  # FLOOR: least probability of sending, 1e-6
         floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
         return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
     def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
         heartbeat = self.trigger.heartbeat
+        # A: steps since it sent. It must send at first (not begun), and at the heartbeat where there is one.
         oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
         due = jnp.where(~begun | oldest, label, 0.0)
         return label - due, due
@@ -354,7 +355,7 @@ class EventFilter(AbstractSizedFilter):
         return jnp.asarray(channel.chance) @ lost.astype(float)
 
     def _find_new_reference(self, sender: slice) -> np.ndarray:
-        """Return the places in (x, r, y) of the next (x, r): y in place of r for the components of the sender."""
+        """Return the indices in (x, r, y) of the next (x, r): y in place of r for the components of the sender."""
         n, m = len(self.states), self.outputs
         places: np.ndarray = np.r_[0 : n + m]
         if self.trigger.needs_reference:
@@ -362,7 +363,7 @@ class EventFilter(AbstractSizedFilter):
         return places
 
     def _restore_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
-        """Return the updated sum `parts`; where all its weights are 0, the sum `before` with FLOOR as likelihood."""
+        """Return the updated sum; where all its weights are 0, the sum `before` with FLOOR (1e-6) as likelihood."""
         stays = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
         stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
         forbidden = ~jnp.isfinite(log_total_weight(parts.log_weight))
@@ -382,7 +383,7 @@ class EventFilter(AbstractSizedFilter):
     def _merge_state(self, state: EventBelief) -> Gaussian:
         """Merge the sum into one Gaussian of the plant's state."""
         merged = take_leading(merge_groups(state.parts).gaussian, len(self.states))  # a stack of one
-        only: Gaussian = jax.tree.map(lambda leaf: leaf[0], merged)
+        only: Gaussian = jax.tree.map(lambda leaf: leaf[0], merged)  # out of the stack
         return only
 
 

@@ -34,7 +34,10 @@ class EventBelief(NamedTuple):
 
     @staticmethod
     def from_sum(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
-        """Return the state that holds a sum: weights may be 0, so that their logarithms are no numbers to hold."""
+        """Return the state that holds a sum, with its weights themselves, since log 0 is no number to be stored.
+
+        `begun`: which senders have sent; `moved`: whether a step was predicted already.
+        """
         return EventBelief(
             weight=jnp.exp(parts.log_weight), gaussian=parts.gaussian, label=parts.label, begun=begun, moved=moved
         )

@@ -105,11 +105,16 @@ def event_filter(
 
 
 def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np.ndarray]:
-    """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities."""
+    """Describe the channel by mode and by pattern of arrivals; return it with the modes' initial probabilities.
+
+    A pattern of arrivals says which components arrive. A channel that drifts, without a finite number of modes, is
+    refused.
+    """
     drifting = [memory for memory in memories(first(channel)).values() if memory.drifts]
     if drifting:
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
+    # One flag of probability 1 in each mode: nothing is told of the mode.
     parts = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
     return vary_over_steps(parts, channel), np.asarray(steps[0].initial)
 
@@ -145,6 +150,9 @@ def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
     """Return the spread of gain and noise by mode and pattern, zero where it is rounding of a known gain.
 
     E[G G'] - M M' of a known gain M is not more than some eps of |M M'|.
+
+    G, n: gain and noise of z = G y + n, M = E G. `size` is |M M'|, padded by the constant's row and column, where it is
+    0.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
@@ -159,11 +167,16 @@ def _has_gaussian_noise(*models: PyTree) -> bool:
 
 
 def _arrival_determines_y(channel: ChannelByPattern) -> bool:
-    """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more."""
+    """Return whether y follows from whatever arrives, without noise: then that it was sent says nothing more.
+
+    So it is where the gain of each possible mode and pattern of arrivals has no spread, and as many independent rows as
+    y has components.
+    """
     # (mode, pattern) that can occur, of patterns in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
         gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
+        # Rows are scaled to 1, so that the rank does not depend on units.
         size = np.abs(gain).max(axis=1, keepdims=True)
         free = rows.all() and not np.any(_gain_and_noise_spread(channel)[j, a])
         if not free or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < gain.shape[1]:
@@ -185,7 +198,10 @@ def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
 
 
 def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
-    """Return whether what arrives is y itself, all of it."""
+    """Return whether what arrives is y itself, all of it.
+
+    p: numbers in y; m: received numbers; mean: E[(G, n)] of z = G y + n, by mode and pattern of arrivals.
+    """
     m, p = channel.mean.shape[-2], channel.mean.shape[-1] - 1
     if m != p:
         return False
@@ -221,7 +237,11 @@ def _check_threshold_rule(
 
 
 def _has_independent_losses(channel: ChannelByPattern) -> bool:
-    """Return whether components arrive unchanged, and are lost independently of each other, without modes."""
+    """Return whether components arrive unchanged, and are lost independently of each other, without modes.
+
+    So the probability of each pattern of arrivals is the product of those of its components. mean: E[(G, n)] of z = G y
+    + n.
+    """
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:
         return False

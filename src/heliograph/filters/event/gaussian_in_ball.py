@@ -72,7 +72,10 @@ def _slice_by_first_component(centre: jax.Array, variance: jax.Array, radius: ja
 
 
 def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Array, radius: jax.Array) -> BallMoments:
-    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere."""
+    """Append two pieces, e_1 < -radius and e_1 > radius: there the other components may lie anywhere.
+
+    `pieces`: moments (piece, ...) where |e_1| <= radius; the components are independent.
+    """
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
     free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
@@ -118,13 +121,17 @@ def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Arra
 
 
 def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Array, inside: bool) -> BallMoments:
-    """Return the moments of e ~ N(centre, variance) in [-radius, radius], (1, ...), or below and above it, (2, ...)."""
+    """Return the moments of e ~ N(centre, variance) in [-radius, radius], (1, ...), or below and above it, (2, ...).
+
+    Where there is no probability, the mean and variance are those without truncation, and the log mass is -inf.
+    """
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
         side, moments = jnp.ones(1), truncated_normal((edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation)
     else:
         side = jnp.array([-1.0, 1.0])
+        # The lower tail is the upper one of -e: `side` turns it.
         moments = upper_tail((radius - side * centre) / deviation)
     possible = jnp.isfinite(moments.log_mass)
     mean = jnp.where(possible, centre + deviation * side * moments.mean, centre)

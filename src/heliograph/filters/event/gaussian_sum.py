@@ -34,7 +34,10 @@ class GaussianSum(NamedTuple):
     label: Float[jax.Array, "K senders ..."]
 
     def relabel_sender(self, s: int, label: jax.Array) -> "GaussianSum":
-        """Give sender s these labels (K, ...), which need not sum to 1: the sum goes into each Gaussian's weight."""
+        """Give sender s these labels (K, ...), probabilities of its states in each of the K Gaussians.
+
+        They need not sum to 1: their sum multiplies the Gaussian's weight. Where it is 0 the label stays.
+        """
         shape = (-1, *[1] * (label.ndim - 1))
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
         share = label / jnp.where(total > 0, total, 1.0).reshape(shape)
@@ -52,6 +55,7 @@ class GaussianSum(NamedTuple):
 
     def select_components(self, places: np.ndarray) -> "GaussianSum":
         """Select components of the Gaussians' vector, in the order of `places`."""
+        # The first components alone need no new factorisation.
         if np.array_equal(places, np.arange(len(places))):
             return self._replace(gaussian=take_leading(self.gaussian, len(places)))
 
@@ -68,7 +72,10 @@ def safe_log(x: jax.Array) -> jax.Array:
 
 
 def log_total_weight(log_weight: jax.Array) -> jax.Array:
-    """Return log of the sum of weights; -inf where all are 0."""
+    """Return log of the sum of weights; -inf where all are 0.
+
+    `log_weight` (K,); relative to the largest one, so that no exponential overflows.
+    """
     top = jnp.max(log_weight)
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
@@ -89,8 +96,12 @@ def truncate_between(parts: GaussianSum, direction: jax.Array, lower: jax.Array,
 
 @jax.jit
 def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
-    """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians."""
+    """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians.
+
+    `row`, `centre`: slopes and mean of d'x in each Gaussian.
+    """
     row, centre = _project_on_direction(parts, direction)
+    # d'x <= -edge is (-d)'x >= edge: the second half is truncated with both signs turned.
     edges = jnp.full(2 * len(centre), edge)
     centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
     return _truncate(concatenate_sums([parts, parts]), centre, row, [edges])
@@ -115,11 +126,15 @@ def merge_groups(parts: GaussianSum, groups: int = 1) -> GaussianSum:
 
 @partial(jax.jit, static_argnames="groups")
 def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
-    """Merge the components of each group into one Gaussian: compiled body of `merge_groups`."""
+    """Merge the components of each group into one Gaussian: compiled body of `merge_groups`.
+
+    Groups are consecutive and of equal size. A label, the probabilities of the sender's states, is averaged by weights.
+    """
 
     def merge_group(parts: GaussianSum) -> GaussianSum:
         """Merge one group; where no component has weight, all count alike."""
         total = log_total_weight(parts.log_weight)
+        # Weights relative to their sum, which has the logarithm `total`.
         share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
         return GaussianSum(total, merge_mixture(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
@@ -135,6 +150,8 @@ def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSu
     """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
 
     The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
+
+    w1 and w2 are the weights of both, and `places` is a range of the vector's components.
     """
     while len(parts.log_weight) > count:
         parts = _merge_cheapest_pair(parts, (places.start, places.stop))
@@ -169,7 +186,11 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     merged = merge_groups(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
 
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
-        """Put the pair joined in the first one's place and the last Gaussian in the second one's: one fewer."""
+        """Return these numbers of the Gaussians after two of them are joined: one fewer.
+
+        `joined`, of the pair joined, goes to the first one's place (mask `is_first`), and the last Gaussian to the
+        second one's.
+        """
         one_each = (-1, *[1] * (values.ndim - 1))  # a mask of Gaussians, beside their numbers
         with_last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
         return jnp.where(is_first.reshape(one_each), joined, with_last_moved)[:-1]

@@ -33,7 +33,10 @@ class LinkMoments(NamedTuple):
     noise: WeightedColumns
 
     def select_sender(self, sender: slice, m: int) -> "LinkMoments":
-        """Select the outputs that carry a sender's components: all, unless each component has its own sender."""
+        """Select the outputs that carry a sender's components: all, unless each component has its own sender.
+
+        `sender`: its components among the m of y; a link of all components at once is not divided.
+        """
         rows = slice(None) if sender == slice(0, m) else sender
         noise = WeightedColumns(self.noise.matrix[rows], self.noise.weights)
         return LinkMoments(self.mean[rows], self.gain_spread[rows, rows], noise)
@@ -42,12 +45,20 @@ class LinkMoments(NamedTuple):
 def augment_by_signal(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
 ) -> GaussianSum:
-    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data."""
+    """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data.
+
+    x: the plant's state, r: the value that a sender compares with y. E[x_i^2] sets the size of numbers that rounding
+    acts on.
+    """
     n = len(start)
 
     def augment_one(both: Gaussian) -> Gaussian:
-        """Append y, which depends on x alone, to one Gaussian."""
+        """Append y, which depends on x alone, to one Gaussian.
+
+        n: length of x; `start`: E[x_i^2] before any data, the size of numbers that rounding acts on.
+        """
         signal = find_signal_moments(plant, sensor, transform, take_leading(both, n), start)
+        # No slope in the components behind x.
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
         return append_rows(
             both, signal.mean, slopes, triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
@@ -59,7 +70,10 @@ def augment_by_signal(
 def predict_with_reference(
     plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data."""
+    """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data.
+
+    r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
+    """
     n = len(start)
     length_of_r = len(both.mean) - n
     image = find_transition_moments(plant, transform, take_leading(both, n), u)
@@ -76,6 +90,8 @@ def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> 
 
     Covariance: root diag(variances) root'. A known component is a column of its own, of variance 0: its row of the root
     is the row of the identity.
+
+    Components at `places` are taken as independent of the others.
     """
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
@@ -105,7 +121,11 @@ def condition_parts_on_received(
     size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        """Return one Gaussian given z, and log of the density of z."""
+        """Return one Gaussian given z, and log of the density of z.
+
+        `arrived`: which of the sender's components arrived; `delivers`: the link hands on y itself, the last m
+        components of `size`.
+        """
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
         if delivers:  # y is z, to the last digit
@@ -117,7 +137,11 @@ def condition_parts_on_received(
 
 
 def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
-    """Return the Gaussian of z = G y + n from each Gaussian of (x, r, y)."""
+    """Return the Gaussian of z = G y + n from each Gaussian of (x, r, y).
+
+    x: the plant's state, r: the value that the sender compares with its signal y (m,). `link`: moments of G and n;
+    `sender`: the components sent.
+    """
 
     def receive_one(x: Gaussian) -> Gaussian:
         """Predict z from one Gaussian."""
@@ -129,7 +153,10 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
 
 
 def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-    """Return E z, slopes and noise of z = G y + n, y the last m components."""
+    """Return E z, slopes and noise of z = G y + n, y the last m components.
+
+    G y: the mean gain gives the slopes, its spread is noise. `second`: E[y y'].
+    """
     centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
     second = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
     noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second, centre))

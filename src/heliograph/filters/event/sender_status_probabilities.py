@@ -23,9 +23,12 @@ class SilenceByCause(NamedTuple):
 
 
 def status_after_sending(label: jax.Array, lost: bool) -> jax.Array:
-    """Return a sender's label (K, M, A, C) after a transmission: 0 steps since then, and one more lost or none.
+    """Return the probabilities of a sender's status after a transmission, which starts its count of steps anew.
 
     The last entry of C counts all larger numbers too; with C = 1 losses are not counted.
+
+    `label` (K, M, A, C): K Gaussians, M modes of the link, A steps since a transmission, C transmissions lost since the
+    last that arrived; `lost`: this one too.
     """
     label = jnp.zeros_like(label).at[:, :, 0].set(jnp.sum(label, axis=2))
     if label.shape[-1] == 1:

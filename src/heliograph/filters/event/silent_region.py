@@ -39,7 +39,10 @@ class SilentRegion(NamedTuple):
         return 2 * len(range(self.outputs)[sender]) + self.is_ball
 
     def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:
-        """Return for each component of a sender the row d with d'(x, r, y) = y - r, and its threshold delta."""
+        """Return for each component of a sender the row d with d'(x, r, y) = y - r, and its threshold delta.
+
+        x: n states, r: the m values that the sender compares with the m signals y.
+        """
         n, m = self.states, self.outputs
         delta = jnp.broadcast_to(jnp.asarray(self.trigger.delta), (m,))
         unit = jnp.eye(n + 2 * m)
@@ -83,6 +86,9 @@ class SilentRegion(NamedTuple):
 
         Two pieces for each component: it is above or below, and those before it are inside. Of a ball these are what
         is outside of the box around it; one piece more is what the ball leaves of the box.
+
+        y: the signal of the sender's components, r: what it compares them with, delta: its threshold, a radius if
+        `is_ball`.
         """
         outside, errors = [], self._error_directions(sender)
         for i, (direction, delta) in enumerate(errors, 1):

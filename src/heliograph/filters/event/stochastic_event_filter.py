@@ -68,7 +68,11 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> StochasticBelief:
-        """Return the prior."""
+        """Return the prior.
+
+        `law`: probabilities of the link's modes; `reference`: what the sender compares y with; `moved`: whether a step
+        was predicted.
+        """
         start = at(self.plant, 0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(
@@ -77,11 +81,14 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: StochasticBelief, u: ArrayLike = (), k: Step = 0) -> StochasticBelief:
-        """Move x and the modes; both ends compute the next reference."""
+        """Move x and the law of the link's modes; both ends of the link compute the next reference.
+
+        The reference is what the sender compares its signal with.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
         rows = jnp.asarray(at(self.channel, k).transition)
-        law = jnp.where(state.moved, state.law @ rows, state.law)
+        law = jnp.where(state.moved, state.law @ rows, state.law)  # at the first step the modes have their initial law
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)
@@ -164,7 +171,11 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _mix_silence_and_outage(
         self, prior: Gaussian, silent: GaussianSum, law: jax.Array, channel: ChannelByPattern, down: jax.Array
     ) -> GaussianSum:
-        """Mix the update by silence (link up) with the prior (link down), by their weights given that no value came."""
+        """Mix the update by silence (link up) with the prior (link down), by their weights given that no value came.
+
+        `law`: probabilities of the modes of the link (M,); `lost`: probability in each mode that nothing arrives.
+        `down`: what the receiver is told, 1 that the link is down; empty if nothing is told.
+        """
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
         parts = [silent.relabel_sender(0, law[None] * (1 - lost))]
         if self.loses:
@@ -178,7 +189,11 @@ class StochasticEventFilter(AbstractSizedFilter):
         return merge_groups(concatenate_sums(parts))
 
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives."""
+        """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives.
+
+        `law` (M,): probabilities of the modes; `chance`: of each pattern of arrivals by mode. The spread is that of (G,
+        n), z = G y + n.
+        """
         whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
             jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
@@ -214,6 +229,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z.
 
         z = gain y + noise has the innovation `value`, of this covariance; silence is by y and the reference.
+
+        FLOOR: least probability, 1e-6. The noise is what the innovation's covariance has beside that of gain y.
         """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
@@ -225,7 +242,11 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _observe_silence(
         self, x: Gaussian, slopes: jax.Array, noise: WeightedColumns, expected: jax.Array, reference: jax.Array
     ) -> tuple[jax.Array, Gaussian]:
-        """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise."""
+        """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise.
+
+        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v, and
+        x = mean + L xi. The normaliser makes the density of r the probability of silence.
+        """
         noise = join_columns(noise, eliminate(self._inverse_weight()))
         after, innovations = condition_on_observation(x, slopes, reference - expected, noise)
         size = jnp.abs(reference) + jnp.abs(expected)
@@ -237,7 +258,11 @@ class StochasticEventFilter(AbstractSizedFilter):
         return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
 
     def _log_silence_normaliser(self) -> jax.Array:
-        """Return log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e."""
+        """Return log of exp(-e' W e / 2) / N(e; 0, W^-1), the same for all e.
+
+        W is the matrix of the sender's rule, which stays silent with the probability exp(-e' W e / 2), e = y - r of m
+        outputs.
+        """
         assert isinstance(self.trigger, StochasticTrigger)
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
@@ -245,7 +270,11 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _condition_on_silence(
         self, prior: Gaussian, signal: Signal, reference: jax.Array, k: Step
     ) -> tuple[jax.Array, Gaussian]:
-        """Return log P(silent) while the link is up, and the prior given silence."""
+        """Return log P(silent) while the link is up, and the prior given silence.
+
+        By a schedule (`Periodic`) silence has the probability 0 in a step that is due, and else 1: it says nothing of
+        x.
+        """
         if isinstance(self.trigger, Periodic):
             due = jnp.asarray(k) % self.trigger.period == self.trigger.phase
             return jnp.where(due, -jnp.inf, 0.0), prior

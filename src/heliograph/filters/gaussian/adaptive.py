@@ -85,7 +85,10 @@ class AdaptiveFilter(AbstractWrapper):
 
     @compile_on_call
     def init(self) -> AdaptiveBelief:
-        """Return the filter's prior, and the variances' with as much weight as forgetting leaves them."""
+        """Return the filter's prior, and for each noise variance an inverse gamma law about its variance in the model.
+
+        PRIOR_SHAPE: the shape of that law, 3, as much as six noises say.
+        """
         shape = jnp.full(self.received, PRIOR_SHAPE)
         variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
         return AdaptiveBelief(self.base.init(), shape, shape * variance)
@@ -137,6 +140,8 @@ class AdaptiveFilter(AbstractWrapper):
 
         They are those of the noise that brings it, of several received numbers their root mean square; of an output
         that none brings 1.
+
+        scale / shape of the inverse gamma law is the learned variance of each received number.
         """
         noise = at(self.noise, k)
         ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
@@ -302,7 +307,7 @@ def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
         """Return the noise of one step."""
-        return describe_outlier_noise(sensor.noise, None, channel, True)
+        return describe_outlier_noise(sensor.noise, None, channel, True)  # None: no outliers of a last hop
 
     noise: ReceivedNoise | OverTime = at_each_step(describe, filter.sensor, filter.channel)
     return noise

@@ -47,21 +47,24 @@ class DiffuseFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> Diffuse:
-        """Return the law before any data."""
+        """Return the Gaussian before any data, with infinite variance in the state's unknown directions."""
         start = first(self.plant)
         spread = start.initial_covariance
         return start_diffuse(jnp.asarray(start.initial_mean), columns_of(spread.known), np.array(spread.unknown))
 
     @predicts
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
-        """Predict x over x+ = A x + B u + w."""
+        """Predict x over x+ = A x + B u + w.
+
+        Where something of x is unknown its variance is infinite; E[x_i^2] at the start sets the rounding of the rest.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
         return predict_diffuse(state, plant.transition_matrix(u), plant.shift(u), noise)
 
     @corrects
     def correct(self, state: Diffuse, z: ArrayLike, k: Step = 0) -> tuple[Diffuse, Innovation]:
-        """Condition on z; of what hears an unknown direction the innovation is NaN."""
+        """Condition on z; the innovation of a number that depends on a direction still unknown is NaN."""
         sensor, z = at(self.sensor, k), jnp.asarray(z)
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
@@ -78,7 +81,7 @@ class DiffuseFilter(AbstractSizedFilter):
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the Rauch-Tung-Striebel step, with finite and infinite factors."""
+        """Return the Rauch-Tung-Striebel step, with factors of the covariance's finite and infinite parts."""
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         noise = triangularise(factor_process_noise(plant, u, second_moments_at_start(self.plant)))
         predicted = jnp.asarray(step.prior.mean)

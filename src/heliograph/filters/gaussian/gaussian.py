@@ -76,7 +76,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
         """
 
         def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
-            """Filter one row; the output is the mean and covariance of its signal, and z near what is expected."""
+            """Filter one row (k, z, u); return the state, and the mean and covariance of its signal before z, and z.
+
+            z is put near what is expected of it: angles within half a turn.
+            """
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
@@ -84,7 +87,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
             return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """Return the same for all rows of one run."""
+            """Return for all rows of z mean and covariance of the signal before each, and z with angles near it.
+
+            `step` filters one row of them; u are the inputs of all rows.
+            """
             start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
             mean, covariance, near = jax.lax.scan(step, start, rows)[1]
             return mean, covariance, near
@@ -94,7 +100,11 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance."""
+        """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance.
+
+        `unknown`: the signal about its mean, where gain and covariance depend on no data (all is linear). `settle` puts
+        attitudes on their group again.
+        """
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
         unknown = signal.about_mean() if self.linear else signal
         after, innovation = correct_signal(signal, channel, self.rule, jnp.asarray(z), self.observed_angles, unknown)

@@ -68,7 +68,10 @@ class AbstractGaussianStateFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Return the mean and covariance of f(x, u) + w."""
+        """Return the mean and covariance of f(x, u) + w.
+
+        Moments of f are those of the filter's transform; E[x_i^2] at the start sets the rounding.
+        """
         return predict_gaussian(
             at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
         )
@@ -111,7 +114,10 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
 
 
 def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
-    """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,)."""
+    """Return factors of Cov w plus the rounding of a state that had the second moments `start`, (n,).
+
+    Numbers of second moments s have a rounding of some eps^2 s as variance: so no covariance is singular by rounding.
+    """
     w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     joined = join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u))))
     factors: WeightedColumns = keep_for_derivatives(triangularise(joined))
@@ -119,7 +125,10 @@ def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -
 
 
 def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
-    """Return the moments of f(x, u), exactly where it is linear, else by the transform."""
+    """Return the moments of f(x, u), exactly where it is linear, else by the transform.
+
+    An image is the mean, the slopes in the factors of x, and the covariance that these leave.
+    """
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
     return transform_about_mean(plant, transform, x, u)[1]
@@ -128,7 +137,10 @@ def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, 
 def predict_gaussian(
     plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """Return the Gaussian of f(x, u) + w; `start` (n,) is E[x_i^2] before any data, which rounding acts on."""
+    """Return the Gaussian of f(x, u) + w; `start` (n,) is E[x_i^2] before any data, which rounding acts on.
+
+    `settle` puts attitudes back on their group about `middle`, the state about which moments are taken.
+    """
     noise = factor_process_noise(plant, u, start)
     if isinstance(plant, LinearPlant):
         return predict_affine(x, plant.transition_matrix(u), plant.shift(u), noise)
@@ -144,6 +156,8 @@ def transform_about_mean(
 
     The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean change
     from m_i: the error shrinks by the square of the attitudes' deviation in each.
+
+    MEAN_STEPS: 4 such steps are taken.
     """
     # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
@@ -166,6 +180,8 @@ def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, sta
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
     `start`: the plant or filter from whose initial law rounding is counted.
+
+    `rest`: covariance of x+ that the slopes in x do not explain.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)

@@ -48,10 +48,12 @@ class AbstractTransform(Module):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Return the moments of function(x) for x with mean (n,) and covariance (n, n)."""
+        # A transform writes either `apply` or `image`; this one, by default, uses the other.
         if type(self).image is AbstractTransform.image:
             raise unwritten(self, "apply")
         x = from_covariance(mean, covariance)
         image = self.image(function, x)
+        # Cov(x, f)
         cross = (x.root * x.variances) @ image.slopes.T
         return Transformed(image.mean, image.columns.covariance, cross)
 
@@ -64,7 +66,10 @@ class AbstractTransform(Module):
 
 
 def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
-    """Return the slopes (D^-1 L^-1 Cov(x, f))' and as curvature what Cov f has more than slopes D slopes'."""
+    """Return the image of x = m + L xi, Cov xi = D, by f: mean, slopes in xi, and the covariance left over.
+
+    Slopes: (D^-1 L^-1 Cov(x, f))'; the curvature is Cov f less slopes D slopes'.
+    """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
     rest = moments.covariance - (slopes * x.variances) @ slopes.T
     return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
@@ -85,6 +90,9 @@ class Cubature(AbstractTransform):
 
         With s_j = sqrt(n d_j) L_j the differences f(m + s_j) - f(m - s_j) make the slopes, and what the sums
         f(m + s_j) + f(m - s_j) differ by from their mean makes the curvature, both with weights 1 / (4 n).
+
+        x has n components, mean m and covariance L D L': d_j are the diagonal of D (variances), L_j the columns of L
+        (root).
         """
         n = len(x.mean)
         steps = square_root(n * x.variances)
@@ -98,7 +106,10 @@ class Cubature(AbstractTransform):
 
 
 def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each."""
+    """Return f at m + step_j L_j and at m - step_j L_j, as columns (p, n) each.
+
+    m: the mean of x (n,); L_j: column j of its root; p: length of f.
+    """
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
     values = evaluate_at_points(function, points.T).T
@@ -147,7 +158,7 @@ class PolynomialMoments(AbstractTransform):
         self.degree = check_count("degree of the polynomial", degree)
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Compute the coefficients, or evaluate at the quadrature points and sum with their weights."""
+        """Return the moments of f(x), exact for a polynomial of `degree`: by coefficients at 2, else by quadrature."""
         deviations = square_root(x.variances)
         factor = x.root @ jnp.diag(deviations)
         if self.degree == 2:
@@ -156,6 +167,7 @@ class PolynomialMoments(AbstractTransform):
         values = evaluate_at_points(function, x.mean + points @ factor.T).T
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
+        # What f has beside its best linear fit, at each point.
         rest = values - center[:, None] - slopes @ points.T
         explained = WeightedColumns(slopes, np.ones(len(deviations)))
         return Image(center, explained, deviations, eliminate(WeightedColumns(rest, weights).covariance))
@@ -180,7 +192,10 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector."""
+    """Return the points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector.
+
+    POINT_LIMIT: most points, 20,000.
+    """
     if count**dimension > POINT_LIMIT:
         raise fail("points of the exact-moment rule", f"at most {POINT_LIMIT:,}", f"{count}^{dimension}")
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)

@@ -139,7 +139,11 @@ class CentredFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: SplitMeanGaussian, u: ArrayLike = (), k: Step = 0) -> SplitMeanGaussian:
-        """Predict about the origin, which becomes what the center moves to."""
+        """Predict about the origin, which becomes what the center moves to.
+
+        The state is a center (`high`) and a Gaussian of small deviations about it. `compensate` evaluates a function
+        with the rest that rounding takes (`low`); `unit`: eps of the precision.
+        """
         plant, center, u = at(self.base.plant, k), jnp.asarray(state.high), jnp.asarray(u)
         unit, x = unit_of(center), state.about_center
         if isinstance(plant, LinearPlant):
@@ -155,10 +159,15 @@ class CentredFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: SplitMeanGaussian, z: ArrayLike, k: Step = 0) -> tuple[SplitMeanGaussian, Innovation]:
-        """Correct about the origin, by what differs from the signal that it has."""
+        """Correct about the origin: subtract the signal of the center from z, and correct the small deviations from it.
+
+        `compensate` evaluates the signal in two parts, `high` and the rest that rounding takes, `low`; `unit`: eps of
+        the precision.
+        """
         sensor, channel, center = at(self.base.sensor, k), at(self.base.channel, k), jnp.asarray(state.high)
         unit, z = unit_of(center), jnp.asarray(z)
         base, signal = _start_at_zero(self.base), compensate(sensor.measure, unit)(Compensated(center))
+        # A random gain multiplies the whole signal: nothing of it may be subtracted.
         if not self.known_gain:
             signal = Compensated(jnp.zeros_like(signal.high), jnp.zeros_like(signal.high))
         z = z - channel.mean_gain @ signal.high
@@ -183,6 +192,9 @@ class CentredFilter(AbstractWrapper):
 def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFilter:
     """Return a filter about an origin that moves with it; one of attitudes or of modes of motion as it is.
 
+    Numbers far from zero then keep the digits of small changes. `known_gain`: no gain of the channel is random or
+    uncertain.
+
     Args:
         filter: one that uses its fields plant, sensor and channel alone.
     """
@@ -203,7 +215,10 @@ def _start_at_zero(base: Any) -> Any:
 
 
 def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float) -> PlantAboutCenter:
-    """Return the plant of deviations from a center, whose state starts at zero."""
+    """Return the plant of deviations from a center, whose state starts at zero.
+
+    `level`: what is subtracted from f, the origin after the step; `unit`: eps of the precision.
+    """
     return PlantAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, deviation=None,
         initial_mean=np.zeros(np.shape(model.initial_mean)), initial_covariance=model.initial_covariance,
@@ -212,7 +227,10 @@ def _center_plant(model: AbstractPlant, center: Array, level: Array, unit: float
 
 
 def _center_sensor(model: AbstractSensor, center: Array, level: Array, unit: float) -> SensorAboutCenter:
-    """Return the sensor of deviations from a center."""
+    """Return the sensor of deviations from a center.
+
+    `level`: what is subtracted from h, the signal of the center; `unit`: eps of the precision.
+    """
     return SensorAboutCenter(
         model=model, center=center, level=level, unit=unit, noise=model.noise, outputs=model.outputs,
         circular=model.circular,

@@ -92,7 +92,11 @@ class GivingInFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> GateAndRival:
-        """Return the belief before any data."""
+        """Return the belief before any data.
+
+        The rival is the state that explains what the gate refuses; counts and evidence begin at 0. NEVER: -1, the gate
+        has not given in yet.
+        """
         start, zero = self.base.init(), jnp.zeros(())
         return GateAndRival(
             believed=start,
@@ -107,7 +111,10 @@ class GivingInFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: GateAndRival, u: ArrayLike = (), k: Step = 0) -> GateAndRival:
-        """Predict the gate's state and its rival over step k."""
+        """Predict the gate's state and its rival over step k.
+
+        The rival is the state that explains what the gate refused. `elapsed`: time since the first refusal in a row.
+        """
         elapsed = state.elapsed
         if TIME_STEP in self.inputs:
             passes = jnp.asarray(u, dtype=float)[self.inputs.index(TIME_STEP)]
@@ -156,6 +163,8 @@ class GivingInFilter(AbstractSizedFilter):
         """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
 
         `refused`: of each received number, its refusals in a row (m,); `elapsed`: time since the first of them.
+
+        `after`, `seconds`: the limits of the gate's rule, None where it has none.
         """
         is_long = jnp.zeros((), dtype=bool)
         if self.after is not None:
@@ -185,10 +194,18 @@ class GivingInFilter(AbstractSizedFilter):
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
 
     def _compare_densities(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
-        """Return the summed log density of the numbers that count (m,) under the rival less that under the gate."""
+        """Return the summed log density of the numbers that count (m,) under the rival less that under the gate.
+
+        The rival explains what the gate refused. Squares of innovations, in deviations, are clipped at the gate's limit
+        c.
+        """
 
         def log_density(innovation: Innovation) -> jax.Array:
-            """Return the log density of each number that counts, of squares up to the gate's limit c, without 2 pi."""
+            """Return each number's log density under its Gaussian, without the 2 pi term; 0 where it does not count.
+
+            `counts` (m,): which numbers are compared. Squared innovations over variances are clipped at c, the gate's
+            limit.
+            """
             variance = jnp.diagonal(jnp.asarray(innovation.covariance))
             variance = jnp.where(counts, variance, 1.0)
             squared = jnp.where(counts, jnp.asarray(innovation.value), 0.0) ** 2 / variance
@@ -202,7 +219,10 @@ class GivingInFilter(AbstractSizedFilter):
         return self.base.estimate(state.believed)
 
     def remark(self, state: GateAndRival) -> Remark:
-        """Say how often the gate has given in, when it last did, and which states moved how far then."""
+        """Say how often the gate has given in, when it last did, and which states moved how far then.
+
+        `given_in`: how often; `step`: number of the last time; `moved`: by how much each state jumped then.
+        """
         times = int(state.given_in)
         if not times:
             return Remark()
@@ -212,7 +232,11 @@ class GivingInFilter(AbstractSizedFilter):
 
 
 def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
-    """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m)."""
+    """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m).
+
+    n states, m received numbers; t: their values without noise; V_i (`of_state`): the variance of t_i, 0 where nothing
+    of the state is in it.
+    """
     prior = predicted.prior
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)
     return jnp.asarray(cross * (e / jnp.where(of_state > 0, of_state, 1.0)))

@@ -107,6 +107,7 @@ class Gate(AbstractWeightingRule):
     seconds: float | None = eqx.field(static=True)
 
     def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
+        """Keep c, the limit of a squared innovation over its variance, and when the gate gives in (None: never)."""
         self.c = scalar("limit of the gate", c, TINY)
         self.after = None if after is None else check_count("after, of a gate", after)
         self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, TINY))
@@ -138,7 +139,10 @@ class StudentVB(AbstractWeightingRule):
         self.degrees = np.zeros(0)
 
     def of_law(self, degrees: Degrees) -> "StudentVB":
-        """Return the same rule with the degrees of each received component."""
+        """Return the same rule with the degrees of each received component.
+
+        Degrees of Student's law, one for each.
+        """
         rule = StudentVB(self.iterations)
         object.__setattr__(rule, "degrees", degrees)
         return rule
@@ -149,6 +153,8 @@ class StudentVB(AbstractWeightingRule):
         """Return the weights (m,) of the last of `iterations` updates, and those that it would give the next one.
 
         w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1.
+
+        e: innovations; t: what z has of the state, its mean subtracted; a weight divides the variance of a noise.
         """
         variance = noise.diagonal
         used = following = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
@@ -185,7 +191,11 @@ class RobustFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Use what arrived of the measurement, component after component or with weights."""
+        """Use what arrived of the measurement, component after component or with weights.
+
+        `rule`: how weights are given to components; None to use the noise's law itself, a mixture of Gaussian branches.
+        `sensed`: the sensor's mean signal, on which the law may depend.
+        """
         before, sensed = self.predict_received(state, k)
         z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
@@ -213,12 +223,18 @@ class RobustFilter(AbstractGaussianStateFilter):
 def signal_without_noise(
     plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Gaussian, start: jax.Array
 ) -> Signal:
-    """Return the moments of h(x) and the mean of its noise, without the noise's spread."""
+    """Return the moments of h(x) and the mean of its noise, without the noise's spread.
+
+    `start`: E[x_i^2] before any data (n,), the size of numbers that rounding acts on.
+    """
     return find_signal_moments(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
-    """Return t = G y + n behind a channel: mean M E y + b, slopes M times the signal's, noise of gain and channel."""
+    """Return t = G y + n behind a channel: mean M E y + b, slopes M times the signal's, noise of gain and channel.
+
+    G, n: gain and noise of the channel, M = E G, b = E n; the noise is that of n and of the spread of G.
+    """
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset
     return PredictedMeasurement(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))

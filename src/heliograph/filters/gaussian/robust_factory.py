@@ -26,7 +26,7 @@ def _student_degrees_of(noise: ReceivedNoise) -> Vector:
     Raises:
         ValueError: noise of another law.
     """
-    if not is_traced(noise.degrees) and np.isnan(noise.degrees).any():
+    if not is_traced(noise.degrees) and np.isnan(noise.degrees).any():  # NaN: not of Student's law
         raise fail("StudentVB", "noise of Student's law (StudentT) in each component", "another law")
     degrees: Vector = noise.degrees
     return degrees

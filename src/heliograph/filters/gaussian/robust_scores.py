@@ -118,7 +118,11 @@ class AbstractWeightingRule(Module):
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights of the update, and those to report, for noise of m components."""
+        """Return the weights of the update, and those to report, for noise of m components.
+
+        Both are the same for a rule that takes one step. The squares are relative: e^2 over its variance, noise
+        included.
+        """
         scale = noise.diagonal
         w = self.weights(e, e**2 / (before.columns.diagonal + scale), scale)
         return w, w
@@ -128,6 +132,8 @@ def update_with_weights(
     before: PredictedMeasurement, z: jax.Array, center: jax.Array, noise: WeightedColumns, rule: AbstractWeightingRule
 ) -> ScoreUpdate:
     """Return one joint update by all of z (m,), its noise r_ij divided by sqrt(w_i w_j) with the weights w of a rule.
+
+    SMALLEST: the weight (1e-200) up to which a component counts as missing.
 
     Args:
         before: prediction of z without its noise.
@@ -161,7 +167,11 @@ def joint_update(before: PredictedMeasurement, e: jax.Array, present: jax.Array,
 def expected_squared_residuals(
     before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
 ) -> jax.Array:
-    """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,)."""
+    """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,).
+
+    e: innovations (m,), t: what they have of the state; t+ and V+ are its mean and covariance given e. `present`: which
+    arrived.
+    """
     t = from_columns(jnp.zeros_like(e), before.columns)
     after, _ = condition_on_observation(t, t.root, e, noise, present)
     return (e - after.mean) ** 2 + after.columns.diagonal
@@ -174,6 +184,9 @@ def expected_branch_precision(
 
     q_j is the probability of branch j given the component alone, r_j its variance (`least`), r the unit (`scale`); the
     mean is sum q_j m_j / r_j over sum q_j / r_j.
+
+    Branches are the Gaussians whose mixture is the noise's law, `log_share` the logs of their shares. `before`:
+    prediction without noise.
     """
     log_share, mean, variance, least = law
     total = jnp.maximum(before.columns.diagonal[:, None] + variance, least)

@@ -67,6 +67,7 @@ class SequentialFilter(AbstractSizedFilter):
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
         # Filters of different structure: one correction each.
+        # ends: index behind each node's last number.
         ends, innovations = np.cumsum([filter.received for filter in self.filters]), []
         for filter, received in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
             state, innovation = filter.correct(state, received, k)
@@ -75,10 +76,14 @@ class SequentialFilter(AbstractSizedFilter):
 
     def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
         """Correct as `correct` does, for filters of one structure: one correction compiled, run over the nodes."""
+        # `arrays`: what differs from node to node, stacked; `rest`: what all filters share.
         arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
         def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
-            """Correct with one node's measurement."""
+            """Correct with one node's measurement.
+
+            `arrays_of_node`: the numbers of its filter; `rest`: what all filters share.
+            """
             arrays_of_node, measurement = node
             filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
             return filter_of_node.correct(belief, measurement, k)
@@ -99,7 +104,10 @@ class SequentialFilter(AbstractSizedFilter):
 
 
 def _join_innovations(parts: Sequence[Innovation]) -> Innovation:
-    """Return one innovation of all nodes' measurements, from each node's given the nodes before it."""
+    """Return one innovation of all nodes' measurements, from each node's given the nodes before it.
+
+    The log likelihoods add up. Between nodes the covariance is 0, since each innovation is given the nodes before.
+    """
     covariance = jax.scipy.linalg.block_diag(*(innovation.covariance for innovation in parts))
     total = jnp.sum(jnp.stack([jnp.asarray(innovation.log_likelihood) for innovation in parts]))
     return Innovation(jnp.concatenate([innovation.value for innovation in parts]), covariance, total)

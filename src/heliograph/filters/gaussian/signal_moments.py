@@ -106,6 +106,8 @@ def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.A
 
     `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
     moments before data grow without end where only inputs hold a plant.
+
+    `reach`: bound of |y_i| by roots of second moments, of each output.
     """
     law = sensor.noise
     reach = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))
@@ -124,7 +126,10 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
-    """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n."""
+    """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n.
+
+    These are the columns of Cov(M (noise of y) + (G - M) y + n). `signal.size`: bound of E[y_i^2], for rounding.
+    """
     rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
     plain = keep_for_derivatives(triangularise_noise(join_columns(signal.noise.through(gain), link, rounding)))
     return join_columns(plain, factor_gain_noise(gain_spread, signal.second, signal.mean))
@@ -154,7 +159,10 @@ def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnova
 def condition_on_measurement(
     x: Gaussian, slopes: jax.Array, noise: WeightedColumns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
-    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive."""
+    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive.
+
+    `angles`: the components of z that are angles. The covariance of the innovation is NaN beside a missing number.
+    """
     present = ~jnp.isnan(z)
     z = wrap_near(z, expected, angles)
     value = z - expected
@@ -165,7 +173,10 @@ def condition_on_measurement(
 
 
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
-    """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m)."""
+    """Return Cov z = M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law (m, m).
+
+    z = G y + n of a channel with M = E G and b = E n; y is the sensor's signal.
+    """
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
     return join_columns(
         WeightedColumns(slopes, signal.prior.variances), make_received_noise(signal, channel)

@@ -42,13 +42,14 @@ class Scalars(Module):
     values: np.ndarray
 
     def __init__(self, first: float, second: float):
+        """Keep the two positive scalars of the covariance bound."""
         self.values = array("scalars of the bound", [first, second], (2,))
         if np.any(self.values <= 0):
             raise fail("scalars of the bound", "two positive numbers", (first, second))
 
 
 def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
-    """Return the scalars as two numbers, NaN where the trace is to be minimised over them."""
+    """Return the two scalars of the bound as numbers; NaN for None, where the trace is to be minimised over them."""
     if scalars is None:
         return np.full(2, np.nan)
     return instance("scalars", scalars, Scalars, "Scalars").values
@@ -132,6 +133,8 @@ def _find_received_slopes_and_covariances(
     """Return M H (m, n), and M H P H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.
 
     M: the channel's mean gain, with rows of zeros for what did not arrive.
+
+    The signal is y = H x + v, P = Cov x, R = Cov v, n states and m received numbers.
     """
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
@@ -144,7 +147,11 @@ def unit_variance_where_absent(present: jax.Array) -> jax.Array:
 
 
 def mask_received(channel: SecondOrder, present: jax.Array) -> jax.Array:
-    """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured."""
+    """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured.
+
+    `channel.power`: the map E[y y'] -> received power, a center and a radius; entry [i, i, a, a] is what y_a gives to
+    z_i.
+    """
     m, p = channel.mean_gain.shape[:2]
     reached = (channel.power.center != 0) | (channel.power.radius != 0)
     parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]

@@ -70,7 +70,11 @@ class AbstractUpdate(Module):
             raise unwritten(self, "correct")
 
         def update(innovation: jax.Array) -> tuple[jax.Array, Gaussian]:
-            """Return the mean after an update with this innovation, whose derivative is the gain, and the posterior."""
+            """Return the mean after an update with this innovation, whose derivative is the gain, and the posterior.
+
+            `present`: which components arrived; `signal`, `channel`: moments of the signal, and the channel's uncertain
+            ones.
+            """
             z = ArrivedInnovation(innovation, present)
             after = self.condition(signal, channel, z, condition_on_received(signal, channel, z)[0])
             return jnp.asarray(after.mean), after
@@ -88,6 +92,7 @@ class AbstractUpdate(Module):
             nominal: the prior conditioned behind the nominal law, the best update of a law that is known.
         """
         prior = signal.prior
+        # `bound`: covariance of the error that this gain leaves, at most.
         gain, bound = self.correct(prior.covariance, signal, channel, z.present)
         after = from_covariance(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
         return keep_where_unchanged(jnp.any(z.present), after, prior)
@@ -153,6 +158,7 @@ class ZeroMean(AbstractUpdate):
     scalar: np.ndarray
 
     def __init__(self, scalar: float | None = None):
+        """Keep the positive scalar of the bound; NaN for None, where the trace is to be minimised over it."""
         self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
         if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
@@ -184,11 +190,12 @@ class Interval(AbstractUpdate):
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Return the worst cases from intervals.
+        """Return moments of the chain's gain, in the worst case of each hop's interval.
 
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
+        # Greatest variance of a hop's gain: largest E g^2 less the square of the smallest |E g|.
         return combine_hop_ranges(
             channel, lambda hop: hop.largest_second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2
         )
@@ -217,7 +224,10 @@ class HopRange(NamedTuple):
 
 
 def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
-    """Return the range of one hop's moments; raise if it is not one gain for all components, with zero-mean noise."""
+    """Return the range of one hop's moments; raise if it is not one gain for all components, with zero-mean noise.
+
+    The gain g has values v_i with probabilities p_i, each known within r_i.
+    """
     if not isinstance(hop, GainAndNoise) or not _is_multiple_of_identity(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
     # Probabilities p_i within r_i: E g within sum |v_i| r_i of its nominal value, E g^2 at most sum v_i^2 r_i above.
@@ -267,6 +277,9 @@ def combine_hop_ranges(channel: AbstractRandomAffine, variance: Callable[[HopRan
 
         As a tensor [i, j, a, b] its result is sum_ab center[i, j, a, b] Y[a, b]; the constant multiplies Y's last
         corner, which is 1.
+
+        `amplitude`: product of the hops' fixed factors; `value`: a second moment of the gain; `noise`: of the result's
+        size.
         """
         center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
         center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))

@@ -55,7 +55,10 @@ class Unscented(AbstractTransform):
         self.kappa = scalar("kappa", kappa)
 
     def check(self, n: int) -> None:
-        """Raise ValueError where there are no such points of n states, or their covariance may be indefinite."""
+        """Raise ValueError where there are no such points of n states, or their covariance may be indefinite.
+
+        alpha, beta, kappa: parameters of the sigma points. ROUNDING: by how much a condition may fail, 1e-12.
+        """
         if is_traced(self.alpha, self.beta, self.kappa):
             return
         alpha, beta, kappa = float(self.alpha), float(self.beta), float(self.kappa)

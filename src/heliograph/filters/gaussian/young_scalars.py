@@ -43,20 +43,32 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     free = jnp.isnan(given)
 
     def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-        """Return log beta after a step of Newton's method for the free scalars alone: f(t) = t of a given one."""
+        """Return t, the scalars' logarithms, after a step of Newton's method for f(t) = t in the free scalars alone.
+
+        `refined`: f(t); `slopes`: its derivatives; `free`: which scalars are not given by the user, and so are
+        searched.
+        """
         zero_if_given = [
             [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
         ]
         return newton_step(t, jnp.where(free, refined, t), zero_if_given)
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        """Return whether a free scalar still moves, and sweeps are left."""
+        """Return whether a free scalar still moves, and sweeps are left.
+
+        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched; SWEEPS:
+        most sweeps; CONVERGED, LOOP: what change is none, absolute and in units of rounding.
+        """
         t, previous, sweeps = carry
         smallest_move = rounding(CONVERGED, t, LOOP)
         return (sweeps < SWEEPS) & jnp.any(free & (jnp.abs(t - previous) > smallest_move))
 
     def iterate(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the next t = log beta, the one before it, and the number of sweeps."""
+        """Return the next t = log beta, the one before it, and the number of sweeps.
+
+        `sweep` returns f(t) and its derivatives, t = f(t) the solution; `fixed`: its other arguments; `free`: which
+        scalars are searched. The first sweep takes f(t) itself, the later ones Newton's step.
+        """
         t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)
         return jnp.where(free & (sweeps == 0), refined, move(t, refined, slopes)), t, sweeps + 1
@@ -73,6 +85,8 @@ def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
     """Return t + (I - J)^-1 (f(t) - t) for one or two components; where that step is too long, f(t).
 
     `refined`: f(t); `slopes`: J.
+
+    It is a step of Newton's method for f(t) = t. LONGEST: the longest step that is trusted, 5.
     """
     residual = refined - t
     if len(residual) == 1:
@@ -128,6 +142,8 @@ def zero_mean_fixed_point_map(
     The trace is tr P - tr(Omega^-1 C' C) + beta e, Omega = base + S / beta, S = shift, e = trace_explained. It is
     stationary where beta^2 e = tr(W S), W = Omega^-1 C' C Omega^-1: the next beta is sqrt(tr(W S) / e).
 
+    beta is the free scalar of Young's inequality, in a bound of the covariance P after an update.
+
     Args:
         t: log beta (1,).
         base: what Omega has beside S / beta (m, m).
@@ -149,7 +165,10 @@ def zero_mean_fixed_point_map(
 def _trace_weight(
     omega: jax.Array, cross_square: jax.Array, others: Sequence[jax.Array]
 ) -> tuple[jax.Array, list[jax.Array]]:
-    """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m)."""
+    """Return W = Omega^-1 C' C Omega^-1, C' C = cross_square, and Omega^-1 X of each of the others, all (m, m).
+
+    Omega: a covariance of what is received; the others X are solved with it in the same call.
+    """
     solve = solver(omega)
     first, *rest = jnp.split(solve(jnp.concatenate([cross_square, *others], axis=1)), 1 + len(others), axis=1)
     return solve(first.T), rest
@@ -163,6 +182,8 @@ def _half_log_ratio(
     The derivatives are (top' / top - bottom' / bottom) / 2, from those of both; None in `by_bottom` where bottom does
     not depend on the variable. Where top or bottom is zero v is the limit, and at the limit the derivatives are 0. No
     quotient or root of zero is taken, so that second derivatives exist.
+
+    SMALLEST_SCALAR: the least scalar, 1e-12.
     """
     is_positive = (top > 0) & (bottom > 0)
     top, bottom = jnp.where(is_positive, top, 1.0), jnp.where(is_positive, bottom, 1.0)

@@ -55,7 +55,7 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: RecordedBelief, u: ArrayLike = (), k: Step = 0) -> RecordedBelief:
-        """Predict the filter's own state, and P = A P A' + Q."""
+        """Predict the filter's own state, and the covariance P given the recording: A P A' + Q."""
         start = second_moments_at_start(self.plant)
         move = motion_of_plant(at(self.plant, k), jnp.asarray(u), start)
         covariance = move.matrix @ state.covariance @ move.matrix.T + move.covariance
@@ -70,7 +70,11 @@ class LinearFilterOfRecord(AbstractSizedFilter):
         """
 
         def correct_mean(mean: jax.Array, value: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the corrected mean and the innovation, from the predicted mean and z."""
+            """Return the corrected mean and the innovation (0 for what is missing), from the predicted mean and z.
+
+            `state.own`: the filter's state, whose covariance and gain depend on no data, so that both are affine in the
+            arguments.
+            """
             gaussian = state.own.gaussian._replace(mean=mean)
             after, innovation = self.filter.correct(state.own._replace(gaussian=gaussian), value, k)
             return after.gaussian.mean, jnp.nan_to_num(innovation.value)

@@ -74,6 +74,8 @@ class DifferentiatedInnovation(NamedTuple):
 def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool) -> EstimateWithDerivatives:
     """Return the estimate before the first step, with its derivatives in each free number.
 
+    A filter behind a random gain also carries the moments of the state before any data, with their derivatives.
+
     Args:
         make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
@@ -137,6 +139,8 @@ def find_model_matrices(
     """Return F, b, Q, H, c and R of step k of a linear filter, under the input u, and the moments before data after it.
 
     `moments`: those before data of the state before the step; None behind a known gain, where none are returned.
+
+    They are x+ = F x + b + w of covariance Q, and z = H x + c + v of covariance R, as received behind the channel.
     """
     plant, sensor, channel = at(filter.plant, k), at(filter.sensor, k), at(filter.channel, k)
     law, gain = sensor.noise, jnp.asarray(channel.mean_gain)
@@ -144,6 +148,7 @@ def find_model_matrices(
     R = gain @ jnp.asarray(law.covariance) @ gain.T + channel.noise.covariance
     if moments is not None:
         moments = moments.predict(F, b, Q)
+        # A random gain adds its spread times E[(y, 1)(y, 1)'] to the noise.
         y = moments.measure(sensor)
         R = R + contract(channel.gain_spread, augmented_second_moment(y.second, y.mean, 1.0))
     H, c = gain @ jnp.asarray(sensor.matrix), gain @ jnp.asarray(law.mean) + jnp.asarray(channel.offset)

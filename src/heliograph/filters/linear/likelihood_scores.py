@@ -46,7 +46,11 @@ class ScoreRecursion(Recursion):
     def step(
         self, state: EstimateWithDerivatives, row: tuple[Array, Array], k: Array
     ) -> tuple[EstimateWithDerivatives, PyTree]:
-        """Return the estimate and its derivatives after row k, and what is kept of the row."""
+        """Return the estimate and its derivatives after row k, and what is kept of the row.
+
+        Kept are log-density, its derivatives, and unless not `informed` the information (2, p, p) in rows up to `half`
+        and from it on. e: innovation, s: its covariance.
+        """
         after, (e, s, *slopes, present, lost) = differentiate_step(self.make, self.x, state, row, k)
         size = jnp.abs(row[0]) + jnp.abs(row[0] - e)
         kept = differentiate_log_density(e, s, (slopes[0], slopes[1]), size, present)
@@ -58,11 +62,18 @@ class ScoreRecursion(Recursion):
         return after, (density, score, jnp.where(within[:, None, None], information, 0.0))
 
     def scan(self, z: Array, u: Array) -> Scores:
-        """Return log-densities (rows,) and scores (rows, p) row by row, and the information; it may be traced."""
+        """Return log-densities (rows,) and scores (rows, p) row by row, and the information; it may be traced.
+
+        p: free numbers. The information (2, p, p) is summed over each half of the rows.
+        """
         Now = tuple[EstimateWithDerivatives, jax.Array]  # a state, and the information of the rows before
 
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
-            """Step over one row: add its information, and put out its log-density and score."""
+            """Step over one row: add its information, and put out its log-density and score.
+
+            `now`: the estimate with its derivatives, and the information summed so far; `halves`: that of this row, in
+            the half of the recording to which it belongs.
+            """
             k, z, u = row
             after, (density, score, halves) = self.step(now[0], (z, u), k)
             return (after, now[1] + halves), (density, score)
@@ -72,7 +83,10 @@ class ScoreRecursion(Recursion):
         return density, score, halves
 
     def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these."""
+        """Return the sums over all rows of a long recording, by chunks; None where it cannot be divided into these.
+
+        `self._start()`: the estimate before the first row, with its derivatives.
+        """
         if not is_long(len(z)):
             return None
         whole = sum_in_chunks(self, self._start(), (z, u))
@@ -84,6 +98,7 @@ class ScoreRecursion(Recursion):
         sums = self.sum_long(z, u)
         if sums is None:
             return None
+        # Rows are passed again, for log-densities and scores row by row: information is a sum already.
         rows = scan_in_chunks(replace(self, informed=False), self._start(), (z, u))
         return None if rows is None else (*rows.outputs, sums[2])
 

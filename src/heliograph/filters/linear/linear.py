@@ -84,7 +84,7 @@ class LinearFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
-        """Predict both pairs of moments: A m + B u + E w and A P A' + Q."""
+        """Predict both pairs of moments, of the estimate and of the state without data: A m + B u + E w, A P A' + Q."""
         return predict_belief(
             state, motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
         )
@@ -104,6 +104,8 @@ class LinearFilter(AbstractSizedFilter):
         """Return the smoother step of x+ = A x + b + w; w is white and independent of gains and past draws.
 
         So the Rauch-Tung-Striebel recursion is the best linear one.
+
+        `moved`: slopes of A x in the factors of x, and factors of w.
         """
         move = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
         moved = move.matrix @ step.before.gaussian.root, move.noise
@@ -134,6 +136,7 @@ class LinearFilter(AbstractSizedFilter):
         """
         from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
 
+        # Behind a known gain no moment before data matters.
         known_gain = not np.any(np.asarray(stack_over_time(self.channel).gain_spread))
         return ScoreRecursion(make, x, half, known_gain, informed=True)
 
@@ -144,7 +147,7 @@ class LinearFilter(AbstractSizedFilter):
     def given_record(self) -> AbstractFilter:
         """Return the same filter with covariances given its data where gains are random: else they are its own."""
         if self.premise is None or self.premise.channel is None or first(self.premise.channel).has_known_gain:
-            return self
+            return self  # no gain is random
         from heliograph.filters.linear.covariance_given_recording import LinearFilterOfRecord
 
         return LinearFilterOfRecord(filter=self, plant=self.plant, **make_sizes("nominal", self, self.received))
@@ -155,6 +158,8 @@ def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Arr
 
     They depend on the error covariance and the state's moments before data alone, not on the estimate, so that
     derivatives by the estimate do not involve them.
+
+    `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
     """
     y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
@@ -173,6 +178,8 @@ def correct_linear(
     """Return the estimate corrected with the components of z (m,) that arrived, and the innovation.
 
     What is expected of z is by the estimate; gain and covariance are by the moments before any data.
+
+    `rule`: how uncertain probabilities of the channel are bounded; `start`: E[x_i^2] at the start, for rounding.
     """
     before_data = signal_before_data(state, sensor, start)
     by_estimate = before_data._replace(mean=jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean))
@@ -258,7 +265,11 @@ def linear_filter(
 
 
 def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-    """Return the filter that estimates the modes of links, plant and sensor jointly with the state."""
+    """Return the filter that estimates the modes of links, plant and sensor jointly with the state.
+
+    By kind of channel: modes of plant or sensor, losses that reveal the mode, an uncertain chain, a sum of independent
+    links, or any other.
+    """
     if is_memory_dependent(first(plant)) or is_memory_dependent(first(sensor)):
         return _make_jump_system_filter(plant, sensor, channel)
     if first(channel).erases:
@@ -310,7 +321,10 @@ def memoryless_filter(
     forgets, matters = without_memory(channel), memory_matters(channel)
 
     def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
-        """Return the filter of a channel without memory, with its claim."""
+        """Return the filter of a channel without memory; its claim is "nominal" where delay or memory was ignored.
+
+        `matters`: whether it was; `update`: how uncertain probabilities are bounded.
+        """
         ignoring = linear_filter(plant, sensor, channel, update)
         assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
         return _claim_nominal(ignoring) if matters else ignoring

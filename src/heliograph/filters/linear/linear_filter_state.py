@@ -30,7 +30,10 @@ class PlantMotion(NamedTuple):
 
 
 def motion_of_plant(plant: LinearPlant, u: jax.Array, start: jax.Array) -> PlantMotion:
-    """Return the plant's motion under the input u; `start` is E[x_i^2] before the first step, (n,)."""
+    """Return the plant's motion under the input u; `start` is E[x_i^2] before the first step, (n,).
+
+    x+ = matrix x + shift + w; `covariance`, `noise`: Cov w, and its factors with rounding.
+    """
     return PlantMotion(
         matrix=plant.transition_matrix(u),
         shift=plant.shift(u),
@@ -85,7 +88,10 @@ class MomentsBeforeData(NamedTuple):
         return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + shift, symmetric(covariance)))
 
     def measure(self, sensor: LinearSensor) -> SignalMoments:
-        """Return the moments of the signal y = C x + v."""
+        """Return the moments of the signal y = C x + v.
+
+        They are its mean, E[y y'] and the columns of its noise, whose law may depend on the signal.
+        """
         matrix, law = jnp.asarray(sensor.matrix), sensor.noise
         mean, explained = matrix @ self.mean + law.mean, matrix @ self.covariance @ matrix.T
         noise = law.given_signal(mean, diagonal(explained))
@@ -97,6 +103,8 @@ def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[ja
     """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
     Behind a known gain nothing depends on them.
+
+    `largest`: the root of the largest number, a limit of second moments; a mean is limited by its root.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
     return _clip_to(mean, largest**0.5), _clip_to(covariance, largest)

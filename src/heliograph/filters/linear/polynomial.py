@@ -98,6 +98,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
         """Correct the inner filter with all monomials of z up to `degree`, less the mean where one is subtracted."""
         z = _subtract_mean(self.centre, z, state.mean, k)
+        # [:-1]: without the constant
         after, innovation = self.inner.correct(state.inner, evaluate_monomials(z, self.degree)[:-1], k)
         return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)
 
@@ -111,7 +112,10 @@ class PolynomialFilter(AbstractSizedFilter):
         return _add_mean(self.inner.after_step(state.inner, k), state.mean)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the lifted system, about the mean."""
+        """Return the smoother step of the lifted system, about the mean.
+
+        The state is of all monomials, with the estimate in a part; `shift` adds the mean that was subtracted.
+        """
         z = evaluate_monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
         inner = step.map_states(lambda state: state.inner)._replace(z=z)
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
@@ -133,7 +137,10 @@ def _initial_mean(centre: UnconditionalMean | None, n: int) -> jax.Array:
 
 
 def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Array:
-    """Return E[x+] = A E[x] + b over step k."""
+    """Return E[x+] = A E[x] + b over step k.
+
+    `centre`: the plant about its unconditional mean; None where no mean is subtracted, and it stays as it is.
+    """
     if centre is None:
         return mean
     c = at(centre, k)
@@ -152,7 +159,10 @@ def _add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
 
 
 def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
-    """Return the innovation of z itself, out of that of its monomials."""
+    """Return the innovation of z itself, out of that of its monomials.
+
+    `degree`: of all monomials of (z, 1).
+    """
     # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
     m, places = len(z), position(len(z) + 1, degree)
     of_z = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
@@ -197,7 +207,10 @@ def polynomial_filter(
 def _lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
-    """Lift the model to monomials up to `degree`, about its mean where the gain is known."""
+    """Lift the model to monomials up to `degree`, about its mean where the gain is known.
+
+    Return the unconditional mean that is subtracted, None behind a random gain, and the lifted system.
+    """
     check_model(plant, sensor, channel)
     centre = find_unconditional_mean(plant, sensor, channel)
     centred_plant = plant if centre is None else centre_plant(plant)
@@ -205,7 +218,10 @@ def _lift_about_mean(
 
 
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
-    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding."""
+    """Test whether the matrices of a time-invariant model have reached a steady state, to rounding.
+
+    `steps`: the matrices along time, of which the last two are compared.
+    """
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
     return all(np.allclose(step[-1], step[-2], rtol=1e-12, atol=0) for step in system.steps)
@@ -259,6 +275,7 @@ class MemoryFilter(AbstractSizedFilter):
     def __init__(
         self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim, centre: UnconditionalMean | None = None
     ):
+        """Join the linear filter and that of its products with z; `centre`: the mean that is subtracted, or None."""
         self.linear, self.products, self.claim, self.centre = linear, products, claim, centre
         self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
         self.kept = products.kept
@@ -276,7 +293,10 @@ class MemoryFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
-        """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
+        """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other.
+
+        `products`: the filter of all products. The innovation returned is that of z alone.
+        """
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
         lifted = jnp.concatenate([evaluate_monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
@@ -331,5 +351,6 @@ def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degre
     if first(channel).remembers:
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
+        # one corner: all probabilities are known
         claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
     return lower_claim_by_noise(claim, plant, sensor, channel)

@@ -93,7 +93,11 @@ class PlannedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
-        """Return m + K (z - C m - c)."""
+        """Return m + K (z - C m - c).
+
+        m: mean; K, C, c: gain, output and offset of step k, as recorded. The stage counts predictions and corrections:
+        2 k + 2 after this.
+        """
         step: LinearStep = at(self.steps, k)
         z, expected = jnp.asarray(z), step.expect(state.mean)
         mean = step.correct(state.mean, z - expected)
@@ -109,7 +113,10 @@ class PlannedFilter(AbstractSizedFilter):
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the planned smoother step with the means of these data."""
+        """Return the planned smoother step with the means of these data.
+
+        `past`: the planned smoother steps, None where none were planned.
+        """
         if self.past is None:
             return super().smoother_step(step)
         planned = cast(SmootherStep, at(self.past, step.k))
@@ -137,6 +144,8 @@ def plan_filter(
 
     Its state is a Gaussian, or holds one. Only the mean may depend on data, and affinely: then F, K and C are
     derivatives, the same at every mean. `projection` (n, N) maps the filter's mean to the plant's states.
+
+    F, K, C: matrices of prediction, gain and output of each step.
     """
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
     if is_traced(arguments):
@@ -157,7 +166,11 @@ def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | 
     zeros = jnp.zeros(filter.received)
 
     def record_step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[LinearStep, jax.Array]]:
-        """Step the filter; the output is the step's matrices, and the covariances before and after correction."""
+        """Step the filter; the output is the step's matrices, and the covariances before and after correction.
+
+        `zeros`: a complete measurement, since matrices depend on no value; `projection`: from the filter's mean to the
+        plant's states.
+        """
         k, u = row
         step, prior, after = record_step_matrices(filter, state, zeros, u, k)
         covariances = jnp.stack([_project_covariance(prior, projection), _project_covariance(after, projection)])
@@ -240,7 +253,7 @@ def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Arra
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
     if isinstance(filter, PlannedFilter):
-        outcome: LinearStep = at(filter.steps, k)
+        outcome: LinearStep = at(filter.steps, k)  # recorded already
         return outcome
     step, _, _ = record_step_matrices(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
@@ -267,11 +280,14 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
     """Linearise a filter's correction at its prediction, with its covariance held.
 
     The filter's state is a Gaussian, or holds one. S = Cov(innovation) - C P C', for its predicted P.
+
+    C: derivative of what is expected of z. Rows and columns of what did not arrive are zero.
     """
     prior = filter.predict(state, u, k)
     x = gaussian_of(prior)
     (_, gain), (output, _), _, innovation = _correction_slopes(filter, prior, jnp.asarray(x.mean), z, k)
     present = ~jnp.isnan(z)
+    # The innovation falls by what is expected of z: its derivative has the other sign.
     output = jnp.where(present[:, None], -output, 0.0)
     total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
     return LinearisedStep(

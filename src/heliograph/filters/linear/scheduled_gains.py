@@ -65,10 +65,12 @@ class ScheduledFilter(AbstractSizedFilter):
     start: np.ndarray
 
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
+        """Keep the gains of each step, the covariances after each, and which received numbers no gain uses."""
         instance("schedule", schedule, Schedule, "a Schedule")
         g = schedule.gains
         self.gains = OverTime(_gains_for_expected_measurement(g))
         self.unused = np.all(g.gain == 0, axis=1) & np.all(g.direct == 0, axis=1)
+        # Before and after each correction, one after the other; NaN at the start, where none is claimed.
         known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
         self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
         self.start, self.claim = schedule.start, schedule.claim
@@ -77,7 +79,11 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> ScheduleState:
-        """Return the schedule's initial state."""
+        """Return the schedule's initial state.
+
+        Nothing is estimated or expected yet (NaN); `complete`: no number was missing; `stage`: predictions and
+        corrections made.
+        """
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(
             value=jnp.asarray(self.start),
@@ -89,7 +95,11 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
-        """Predict as if the expected measurement arrived."""
+        """Predict as if the expected measurement arrived.
+
+        s: state of the recursion of the saved gains; `complete`: no number was missing; `stage`: predictions and
+        corrections made.
+        """
         g: Gains = at(self.gains, k)
         s = state.value
         return ScheduleState(
@@ -102,7 +112,11 @@ class ScheduledFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
-        """Add the innovation times the gains of step k."""
+        """Add the innovation times the gains of step k.
+
+        `unused`: numbers that no gain uses, which may be missing. Once another was, the saved covariances hold no more:
+        NaN.
+        """
         g: Gains = at(self.gains, k)
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
@@ -132,7 +146,11 @@ class ScheduledFilter(AbstractSizedFilter):
 
 
 def _gains_for_expected_measurement(g: Gains) -> Gains:
-    """Return the gains of a step without data: e = G s + g for z in s+ = F s + K z + c and xhat = L s + J z + d."""
+    """Return the gains of a step without data: e = G s + g for z in s+ = F s + K z + c and xhat = L s + J z + d.
+
+    e: expected measurement; s: state of the gains' recursion; F, K, L, J, c, d: its matrices. e in place of z leaves
+    functions of s alone.
+    """
     return g._replace(
         transition=g.transition + g.gain @ g.expected,
         offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
@@ -160,6 +178,7 @@ class LinearSystemFilter(AbstractSizedFilter):
     projection: np.ndarray
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
+        """Keep the steps of a linear system, factors of its noises, its initial moments and its projection."""
         instance("system", system, LinearSystem, "a LinearSystem")
         self.steps, self.noises = OverTime(system.steps), OverTime(_factor_noises(system))
         self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
@@ -180,7 +199,10 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the components of z that arrived."""
+        """Correct with the components of z that arrived.
+
+        z = output x + offset + noise; `slopes` of z are in the factors of x.
+        """
         s: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
         expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
@@ -215,6 +237,8 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
 
     A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
     else one that repeats another would measure, without noise, the state times what rounding left of their difference.
+
+    `lost`: rounding errors that the noise's variances have themselves, where they came out of a subtraction.
     """
     s = system.steps
     of_states, of_received = _second_moments_of_steps(system)
@@ -233,6 +257,8 @@ def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -
     """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
 
     Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
+
+    `seconds`: second moments of the numbers; `lost`: rounding errors of the noise's own variances.
     """
 
     def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:
@@ -248,6 +274,8 @@ def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarr
 
     They are the sizes of what is summed, for its rounding. By the moments before any data, since parts of a system that
     start at zero do not stay there; limited to numbers whose squares are finite.
+
+    A y + a is the next state y of the system, with rows of A in absolute value.
     """
     s, mean, covariance = system.steps, system.mean, system.covariance
     largest = float(np.finfo(float).max) ** 0.5  # of a second moment; of a mean its root

@@ -120,6 +120,8 @@ def _propagate_moments(
 
     x+ = A x + b + w of the plant, s- = F s + f of the filter, and the modes move by their chain.
 
+    s: the mean of the filter, whose state is affine in the data; 1{mode}: indicator of the channel's mode.
+
     Args:
         moments: E[r r' 1{mode}] before the step.
         plant: the true plant.
@@ -135,6 +137,7 @@ def _propagate_moments(
     move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(inputs)
     before = mix_moments_of_modes(rows, moments)
+    # `before[:, n, n]`: E[1 1{mode}], the probability of each mode.
     return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
 
 

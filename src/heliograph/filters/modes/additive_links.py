@@ -104,7 +104,11 @@ class AdditiveModalFilter(AbstractModalFilter):
 
     @predicts
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
-        """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law."""
+        """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law.
+
+        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode, less its probability; `second`: E[x~
+        x~'] before data.
+        """
         move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
         rows = self._transition_matrices(state, k)
         # F zeta about the moving centre.
@@ -124,6 +128,9 @@ class AdditiveModalFilter(AbstractModalFilter):
 
         Cov(z - E[z | zeta]) = T(C~ E[x~ x~'] C~' + R~) + sum_ab Gamma_ab D_a R D_b' + Cov n, T the mean spread of the
         gains given the modes, D_0 = Hbar.
+
+        zeta: products of x~ = (x - centre, 1) and functions of the modes, D_a the gain by function a, Gamma the
+        functions' second moments.
         """
         output, x = self._measurement_model(state, k), state.gaussian
         after, innovation = condition_modes_on_received(x, x.mean - self._mean_from_centre(state.centre), output, z)
@@ -133,6 +140,8 @@ class AdditiveModalFilter(AbstractModalFilter):
         """Return the smoother step of zeta+ = F zeta + noise, zeta the products of x~ and functions of the modes.
 
         `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
+
+        x~ = (x - centre, 1), and L the factor of Cov zeta.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
         moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
@@ -217,7 +226,10 @@ class AdditiveModalFilter(AbstractModalFilter):
 
 
 def _gains_by_function(terms: Sequence[ChannelByMode], laws: Laws) -> jax.Array:
-    """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1)."""
+    """Return Hbar and all D_a, stacked: (1 + functions, m, p + 1).
+
+    z = sum of terms' H y: Hbar is the mean gain over modes, D_a that of a mode less that of its term's first mode.
+    """
     means = [jnp.asarray(term.mean) for term in terms]
     total_mean = sum(jnp.einsum("j,jmp->mp", law, mean) for law, mean in zip(laws, means, strict=True))
     return jnp.concatenate([jnp.asarray(total_mean)[None], *(mean[1:] - mean[:1] for mean in means)])
@@ -229,7 +241,11 @@ def _next_laws(laws: Laws, rows: Laws) -> Laws:
 
 
 def _function_transition(rows: Laws) -> jax.Array:
-    """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j."""
+    """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
+
+    phi: 1 and, of each chain, the indicators (less their probabilities) of its modes but the first; Pi: transition
+    matrix.
+    """
     parts = [(chain[1:, 1:] - chain[:1, 1:]).T for chain in rows if len(chain) > 1]
     matrix: jax.Array = block_diag(np.eye(1), *parts)
     return matrix
@@ -246,11 +262,15 @@ def _second_moment_of_functions(laws: Laws) -> WeightedColumns:
 
 
 def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> WeightedColumns:
-    """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i."""
+    """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i.
+
+    `one` (rows, columns): factor of the first block; an empty C_i adds nothing.
+    """
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
     weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
     blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
+    # Behind the first row block comes a row of zeros for the other columns.
     top = jnp.concatenate([jnp.asarray(one), np.zeros((1, blocks.shape[1]))], axis=1)
     return WeightedColumns(jnp.concatenate([top, jnp.pad(blocks, ((0, 0), (one.shape[1], 0)))]), weights)
 
@@ -266,6 +286,7 @@ def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Ch
 def independent_terms(channel: Channel) -> list[Channel]:
     """Return the terms of a sum that share no memory; a channel that is no sum, or of one term, is that term."""
     steps = [split_terms_without_common_memory(step) for step in unstack(channel)]
+    # Steps that split differently have no terms in common.
     if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
         return [channel]
     return [vary_over_steps(parts, channel) for parts in zip(*steps, strict=True)]

@@ -46,6 +46,9 @@ def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M
     """Return the channel at each step by mode and pattern of arrivals, the patterns being those of all steps.
 
     `flags`: P(flag | mode).
+
+    A pattern says which components arrive. The transition to a step is that of the step before; the first step, which
+    has none before, takes its own.
     """
     outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}
@@ -113,14 +116,21 @@ class HasPatterns(Protocol):
 
 
 def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
-    """Return the index of the smallest possible pattern in which all components that arrived arrive."""
+    """Return the index of the smallest possible pattern in which all components that arrived arrive.
+
+    A larger one may have brought numbers that were left out as NaN. `present`: components by pattern; `chance`: by mode
+    and pattern.
+    """
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
     fits = jnp.all(present | ~arrived, axis=1) & possible
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
 
 def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the innovation of a flag, 0 as it is known, NaN if it is missing, and the covariance with it appended."""
+    """Return the innovation of a flag, 0 as it is known, NaN if it is missing, and the covariance with it appended.
+
+    A flag is a number received that tells the mode of a link; its covariance is 0.
+    """
     innovation = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
     lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), innovation))
     padded = jnp.pad(covariance, ((0, 1), (0, 1)))

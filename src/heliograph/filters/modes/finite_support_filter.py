@@ -125,6 +125,7 @@ class MixtureFilter(AbstractSizedFilter):
         """Return the prior, and the initial law of the modes."""
         start = at(self.plant, 0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
+        # moved: no step was predicted
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
     @predicts
@@ -149,7 +150,11 @@ class MixtureFilter(AbstractSizedFilter):
         present = ~jnp.isnan(z)
 
         def condition_on_combination(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> _CombinationUpdate:
-            """Return the Kalman update by z = gain x + offset + noise."""
+            """Return the Kalman update by z = gain x + offset + noise.
+
+            x: the predicted Gaussian; `size`: roots of E[x_i^2], for rounding; `present`: which of z arrived.
+            `certain`: how many components it determines exactly.
+            """
             slopes, value = gain @ x.root, wrap_angles(z - gain @ x.mean - offset, self.observed_angles)
             noise = join_columns(noise, rounding_of((jnp.abs(gain) @ size) ** 2))
             after, innovations = condition_on_observation(x, slopes, value, noise, present)
@@ -178,7 +183,10 @@ class MixtureFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(x.mean, first(self.plant).angles), x.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of x+ = A x + b + w, of the one Gaussian before and after."""
+        """Return the smoother step of x+ = A x + b + w, of the one Gaussian before and after.
+
+        The mixture was merged to one Gaussian, so that the claim is nominal.
+        """
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         slopes = plant.transition_matrix(u) @ step.before.gaussian.root
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
@@ -192,6 +200,7 @@ def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " 
     density is negligible.
     """
     agrees = jnp.isfinite(likelihood)
+    # -1: no combination agrees with z.
     most = jnp.max(jnp.where(agrees, certain, -1))
     return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
 

@@ -26,6 +26,7 @@ def orthogonalise_first_rows(
     for i in range(count):
         weighted = weights * rows[i]
         variances.append(rows[i] @ weighted)
+        # Only rows below row i change; a row without variance has no projection.
         share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
         rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
     return rows, numbers, jnp.stack(variances)

@@ -165,7 +165,7 @@ class ModalFilter(AbstractJointModalFilter):
 
     @compile_on_call
     def init(self) -> ModalBelief:
-        """Return the prior, independent of the mode."""
+        """Return the prior of x 1{mode} in each mode; state and mode are independent."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         prior, second = compute_initial_moments(start, self.initial)
         moments, centre = law[:, None, None] * second, jnp.asarray(start.initial_mean)
@@ -176,6 +176,8 @@ class ModalFilter(AbstractJointModalFilter):
         """Move the mode by the chain and x~ by its plant; at the first prediction the mode has its initial law.
 
         Cov(zeta+ - F zeta)[j, l] = A~_j sum_i (delta_jl Pi_ij - Pi_ij Pi_il) E_i A~_l' + delta_jl P(j) Q~_j.
+
+        zeta: x~ = (x - c, 1) times each mode's indicator; E_i = E[x~ x~' 1{i}]; Pi: the chain; A~, Q~: the plant.
         """
         rows = self._transition_matrix(state, k)
         arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
@@ -194,6 +196,8 @@ class ModalFilter(AbstractJointModalFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~_j E_j C~_j' + P(j) R~_j) + P(j) (Hbar_j R~_j Hbar_j' + Cov n_j), T_j the
         spread of the gains in mode j.
+
+        zeta: x~ = (x - c, 1) times each mode's indicator; E_j = E[x~ x~' 1{j}]; C~, R~: the sensor; Hbar: mean gain.
         """
         centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
         after, innovation = condition_modes_on_received(state.gaussian, centred, self._measurement_model(state, k), z)
@@ -204,7 +208,7 @@ class ModalFilter(AbstractJointModalFilter):
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
-        """Return F L of zeta = E zeta + L xi, and columns of Cov(zeta+ - F zeta)."""
+        """Return F L of zeta = E zeta + L xi, zeta the state times each mode's indicator, and columns of its noise."""
         rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
         # What the chain draws moves in its mode.
         among = mode_transition_covariance(state.moments, rows)
@@ -224,7 +228,7 @@ class ModalFilter(AbstractJointModalFilter):
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, arriving[:, :, -1])
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
-        """Return z = common + H zeta + v, H from the modes' gains, and columns of Cov v."""
+        """Return z = common + H zeta + v, zeta the state times each mode's indicator, and columns of Cov v."""
         channel, sensors, law = at(self.channel, k), list_mode_models(at(self.sensor, k)), state.law
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
@@ -274,7 +278,10 @@ def factor_with_last_mode(among: jax.Array) -> WeightedColumns:
 
 
 def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
-    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales."""
+    """Return the columns of sum_j P(j) (Hbar_j Cov(v_j) Hbar_j' + Cov n_j) (m, m), which no signal scales.
+
+    Hbar_j: mean gain in mode j of probability P(j), v_j: noise of what is sent, n_j: that of the link.
+    """
     gains = jnp.asarray(channel.mean)[:, :, :-1]
     received = [noise.through(gain).times(p) for gain, noise, p in zip(gains, sent, law, strict=True)]
     return join_columns(*received, side_by_side(channel.noise, law))
@@ -286,7 +293,7 @@ def rounding_of_received(gains: jax.Array, sent: jax.Array) -> WeightedColumns:
 
 
 def kron(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return A x B, by a matrix product, which keeps known zeros."""
+    """Return the Kronecker product of a and b, by a matrix product, which keeps known zeros."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
     return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
@@ -309,7 +316,7 @@ def condition_modes_on_received(
 
 
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
-    """Return the law of zeta at the start, and E[x~ x~'].
+    """Return the law of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...) at the start, x~ = (x - c, 1), and E[x~ x~'].
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
@@ -337,7 +344,7 @@ def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, 
     Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
     """
     common = law @ output[:, :, -1] / jnp.sum(law)
-    return output.at[:, :, -1].add(-common), common
+    return output.at[:, :, -1].add(-common), common  # output: E[z 1{mode}] by (x, 1)
 
 
 def concatenate_modes(output: jax.Array) -> jax.Array:

@@ -43,7 +43,10 @@ def centred_measurement(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Ar
 
 
 def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> WeightedColumns:
-    """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator."""
+    """Return factors of the process noise of x~ = (x, 1), with the rounding of the state and of the indicator.
+
+    `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    """
     w = factor_process_noise(plant, jnp.asarray(u), start)
     of_indicator = rounding_of(np.ones(1))
     matrix = jax.scipy.linalg.block_diag(w.matrix, of_indicator.matrix)
@@ -99,6 +102,8 @@ def noise_by_mode(
     """Return columns of the process noise and rounding of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x, 1).
 
     The block of mode j is P(j) Cov w_j, with P(j) = law[j] and the plant number modes[j].
+
+    `start`: E[x_i^2] at the start, for rounding.
     """
     parts = [noise_in_mode(plant, u, start) for plant in plants]
     matrix = jax.scipy.linalg.block_diag(*(parts[mode].matrix for mode in modes))
@@ -110,7 +115,11 @@ def noise_by_mode(
 def centred_sensing(
     sensors: Sequence[LinearSensor], modes: Sequence[int], centre: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return C~_j and R~_j of the centred state in each mode (M, p + 1, n + 1), (M, p + 1, p + 1)."""
+    """Return C~_j and R~_j of the centred state in each mode (M, p + 1, n + 1), (M, p + 1, p + 1).
+
+    y~ = C~_j x~ + noise of covariance R~_j, with x~ = (x - centre, 1) and y~ = (y, 1); modes[j]: the sensor that mode j
+    has.
+    """
     by_sensor = [centred_measurement(sensor, centre) for sensor in sensors]
     measures, noises = zip(*(by_sensor[mode] for mode in modes), strict=True)
     return jnp.stack(measures), jnp.stack(noises)

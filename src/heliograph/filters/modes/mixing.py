@@ -100,7 +100,11 @@ class MergeByMode(AbstractMerging):
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
     def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Return one component for each present mode, merged over the modes before, and the weights (M, M)."""
+        """Return one component for each present mode, merged over the modes before, and the weights (M, M).
+
+        `weight`: of each pair of the mode before and the present one, one component each; the weights returned are
+        diagonal.
+        """
         pairs = weight[:, None] * (self.list_update_pairs(modes)[1][:, None] == np.arange(modes))
         merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs))
         return merged, jnp.diag(jnp.sum(pairs, axis=0))
@@ -249,7 +253,11 @@ def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
 def _predict_each(
     plant: AbstractPlant, transform: AbstractTransform, x: MixtureMoments, u: jax.Array, start: jax.Array
 ) -> Gaussian:
-    """Return f(x, u) + w of each of some moments; a linear plant moves the moments themselves."""
+    """Return the Gaussian of f(x, u) + w for each of some moments (..., n) of x.
+
+    `start`: E[x_i^2] at the start, for rounding. Moments of a linear plant are moved as they are, without factors
+    before.
+    """
     if not isinstance(plant, LinearPlant):
         before = jax.vmap(from_covariance_by_elimination)(*x)
         return jax.vmap(lambda part: predict_gaussian(plant, transform, part, u, start))(before)

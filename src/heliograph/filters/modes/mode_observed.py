@@ -76,7 +76,10 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> ModeObservedBelief:
-        """Return the belief before any data."""
+        """Return the belief before any data.
+
+        Nothing was received (z is NaN), and the last step moved nothing (matrix I, no noise).
+        """
         belief = prior_belief(at(self.plant, 0))
         n = len(belief.gaussian.mean)
         zeros = jnp.zeros((n, n))
@@ -130,7 +133,11 @@ class ModeObservedFilter(AbstractSizedFilter):
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
-        """Return the prior of step k after the last measurement is used again, given the memories' states then."""
+        """Return the prior of step k after the last measurement is used again, given the memories' states then.
+
+        The states of the links' memories are received one step late: then the last correction can be made with the
+        moments given them.
+        """
         last = jnp.maximum(jnp.asarray(k) - 1, 0)
         channel = _find_moments_given_states(at(self.channel, last), memory_states)
         start = second_moments_at_start(self.plant)
@@ -141,6 +148,8 @@ class ModeObservedFilter(AbstractSizedFilter):
         """Return the channel's moments at step k given the memories' states one step before, at the first step without.
 
         `begun`: whether there was a step before.
+
+        A memory is what a link remembers (such as its mode). Both are computed, and one is taken.
         """
         channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
         following = _find_moments_given_earlier_states(at(self.channel, last), channel, memory_states)
@@ -179,7 +188,10 @@ def _find_moments_given_earlier_states(
 
 
 def _find_nominal_moments(channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced."""
+    """Return the mean and spread of the channel under the nominal law, for numbers that may be traced.
+
+    Nominal: under the probabilities as given, without their radii; traced: free numbers of a fit.
+    """
     mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
     spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
     # Bounds of an uncertain law are not used: their maps are zero.

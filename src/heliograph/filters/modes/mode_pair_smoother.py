@@ -78,7 +78,11 @@ def move_pairs(
     """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
-        """Move one Gaussian by one plant: f(x, u) by its slopes in x, and what these do not explain."""
+        """Move one Gaussian by one plant: f(x, u) by its slopes in x, and what these do not explain.
+
+        `transform`: moments of a nonlinear f; u: input; `start`: E[x_i^2] at the start, for rounding. It returns the
+        law of the next state, and x given it.
+        """
         image = find_transition_moments(plant, transform, x, u)
         rest = sum_unexplained(image, factor_process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
@@ -166,7 +170,10 @@ class ModalSmootherStep(SmootherStep):
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
-            """Condition one pair on what the future says of its later mode; return it and the log-likelihood."""
+            """Condition one pair on what the future says of its later mode; return it and the log-likelihood.
+
+            A pair: a mode and the next one. The future says value = rows x + noise, as if measured.
+            """
             noise, expected = WeightedColumns(jnp.eye(len(x.mean)), observed.noise), observed.rows @ x.mean
             after, innovation = condition_on_measurement(x, observed.rows @ x.root, noise, observed.value, expected)
             return after, jnp.asarray(innovation.log_likelihood)
@@ -186,7 +193,11 @@ class ModalSmootherStep(SmootherStep):
         return ModalLaw(merged, law / jnp.sum(law))
 
     def estimate_from(self, law: "ModalLaw | Gaussian") -> Estimate:
-        """Return the estimate of the plant's state, with the modes' probabilities where these are smoothed."""
+        """Return the estimate of the plant's state, with the modes' probabilities where these are smoothed.
+
+        `law`: a Gaussian of the whole mixture, or one for each mode with its probability. `limits`: of states, within
+        which it is cut.
+        """
         if isinstance(law, Gaussian):
             return super().estimate_from(law)
         parts = law.gaussian
@@ -195,12 +206,14 @@ class ModalSmootherStep(SmootherStep):
             log_mass, parts = truncate_to_limits(held, self.limits)
             weight = law.law * jnp.exp(log_mass - jnp.max(log_mass))
             law = ModalLaw(parts, weight / jnp.sum(weight))
+        # Angles of all modes within half a turn of those of the likeliest.
         mean = wrap_near(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
         mean, covariance = moments_of_mixture(mean, jax.vmap(lambda x: x.covariance)(parts), law.law)
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
 
     def start(self) -> EarlierState:
         """Return the state after this step as an earlier state that is yet to be carried ahead."""
+        # None: several plants, where no one function moves the whole mixture.
         if self.before is None:
             raise fail("smoothing of plants with modes", "FixedInterval or FixedLag", "a fixed point")
         return super().start()

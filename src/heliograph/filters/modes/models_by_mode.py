@@ -21,7 +21,10 @@ from heliograph.random_affine.modes import JointModes, joint_modes
 def describe_joint_modes(
     plant: AbstractPlant, sensor: AbstractSensor, channel: Channel, nodes: int
 ) -> tuple[JointModes, ChannelByPattern | OverTime]:
-    """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step."""
+    """Return the modes of plant, sensor and links as one chain, and the channel by mode and arrivals, at each step.
+
+    `nodes`: number of modes that stand for a gain that drifts.
+    """
     steps = [joint_modes(c, nodes, beside=(plant, sensor)) for c in unstack(channel)]
     modes = len(steps[0].initial)
     parts = describe_by_pattern(steps, np.ones((modes, 1)))  # no flag tells the mode
@@ -33,7 +36,10 @@ def describe_joint_modes(
 
 
 def _check_density(channel: ChannelByPattern) -> None:
-    """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one."""
+    """Raise unless z has a density in every combination of mode and pattern of arrivals, for an x that has one.
+
+    `present`: which components arrive; `mean`, `spread`: moments of (G, n), z = G y + n.
+    """
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
         rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
@@ -43,7 +49,10 @@ def _check_density(channel: ChannelByPattern) -> None:
 
 
 def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...]:
-    """Return for each joint mode the number of the plant's or sensor's model in it, 0 for one that has no modes."""
+    """Return for each joint mode the number of the plant's or sensor's model in it, 0 for one that has no modes.
+
+    `by_mode`: the model itself in each joint mode, which is found again by identity.
+    """
     if isinstance(model, OverTime) and isinstance(first(model), ModalPlant | ModalSensor):
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")
     if not isinstance(model, ModalPlant | ModalSensor):

@@ -112,6 +112,7 @@ def _correct_in_mode(
     """Correct the prior of a signal in one mode of the channel, of moments as in `SecondOrder`."""
     expected = mean[:, :-1] @ signal.mean + mean[:, -1]
     z = wrap_near(z, expected, angles)
+    # mean: E[(G, n)], z = G y + n
     slopes, noise = mean[:, :-1] @ signal.slopes, noise_behind_gain(signal, mean[:, :-1], gain_spread, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
@@ -180,7 +181,7 @@ class MultipleModelFilter(AbstractSizedFilter):
         """Return the prior in every component, and the initial law of the modes."""
         start, weight = at(self.plant, 0), self.merging.initial_weights(jnp.asarray(self.initial))
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
-        return ModalBeliefs(parts, weight, jnp.asarray(False))
+        return ModalBeliefs(parts, weight, jnp.asarray(False))  # moved: no step was predicted
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
@@ -209,7 +210,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Correct each component in each mode with z, and weight them by their likelihood."""
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
-        _, j = self.merging.list_update_pairs(modes)
+        _, j = self.merging.list_update_pairs(modes)  # the mode in which each component is updated
         (signal, weights), plant = self.prior_signals(state, k), list_mode_models(at(self.plant, k))[0]
         after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
         parts = after._replace(mean=align_angles(plant, after.mean, weight))

@@ -97,7 +97,11 @@ class ParticleFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> Particles:
-        """Return the prior in every particle, with modes in proportion to their initial law."""
+        """Return the prior in every particle, with modes in proportion to their initial law.
+
+        Particle i of n has the mode at the share (i + 1/2) / n of the distribution. `moved`: whether a step was
+        predicted.
+        """
         start, n = at(self.plant, 0), self.particles
         parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
@@ -111,7 +115,11 @@ class ParticleFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
-        """Draw each particle's next mode, and predict its Gaussian."""
+        """Draw each particle's next mode, and predict its Gaussian.
+
+        It is drawn by its row of the channel's transition matrix; at the first step the modes stay as drawn at the
+        start.
+        """
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]

@@ -72,7 +72,7 @@ class SideInformationBelief(NamedTuple):
 
     @property
     def errors(self) -> WeightedColumns:
-        """E[e e' | side information] as columns (N, M q)."""
+        """E[e e' | side information] as columns (N, M q): e the error of the estimate, q columns of each of M modes."""
         moments = self.moments
         return side_by_side(
             WeightedColumns(moments.matrix[:, : len(self.mean)], moments.weights), np.ones(len(self.lower))
@@ -147,7 +147,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
         def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> WeightedColumns:
             """Return E[q+ q+' 1{mode j}], from the chances of i -> j and the probability of j."""
-            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
+            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)  # rows: of the chain
             process = WeightedColumns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
             return triangularise(join_columns(side_by_side(moved, chances), process))
 
@@ -195,7 +195,7 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: SideInformationBelief) -> Estimate:
-        """Return x = c + sum_j zeta^j, and the covariance of its error."""
+        """Return x = c + sum_j zeta_j, zeta_j the estimate of (x - c) 1{mode j}, and the covariance of its error."""
         projection = make_mode_sum_matrix(len(self.states), len(self.initial))
         mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
         return Estimate(mean, covariance, self.claim)
@@ -229,7 +229,7 @@ def _make_belief(
     mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
 ) -> SideInformationBelief:
     """Build the state from the triangular factors of each mode's moments (M, q, q)."""
-    lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))
+    lower = jax.vmap(below_diagonal)(jnp.asarray(moments.matrix))  # what is below the unit diagonal
     return SideInformationBelief(
         mean=mean, lower=lower, variances=jnp.asarray(moments.weights), centre=centre, moved=moved
     )
@@ -269,6 +269,7 @@ def _make_measurement_model(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
         """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain."""
+        # measure, noise: y~ = (y, 1) = measure x~ + noise; size: E[x_i^2] at the start, for rounding.
         sent = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
         plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
@@ -388,5 +389,6 @@ def side_information_filter(
 def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[ChannelByPattern], bool]:
     """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
     steps = [joint_modes(c) for c in unstack(channel)]
+    # one corner: known probabilities
     is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
     return steps[0].initial, describe_by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known

@@ -65,7 +65,10 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     @compile_on_call
     def init(self) -> UncertainBelief:
-        """Return the prior, independent of the mode, whose initial law is known."""
+        """Return the prior, independent of the mode, whose initial law is known.
+
+        `low`, `high`: ends of the modes' law, equal at the start; `second`: E[x~ x~'], x~ = (x - centre, 1).
+        """
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         prior, second = compute_initial_moments(start, self.initial)
         centre = jnp.asarray(start.initial_mean)
@@ -75,7 +78,11 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
-        """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
+        """Propagate the bound on Sigma-; at the first prediction the mode has its initial law.
+
+        Sigma-: covariance of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1). `young`: scalar of
+        Young's inequality, by which the bound of the nominal part grows; `fresh`: noise and the uncertain part.
+        """
         (rows, radius), x = self._chain_and_radius(state, k), state.gaussian
         move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
         root, young, fresh = self._transition_factors(state, u, k)
@@ -91,6 +98,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
         """Return the modes' transition matrix and the radius of its entries; before the first prediction I and 0."""
         channel = at(self.channel, k)
+        # Modes keep their initial law up to the first step.
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
         return rows, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
 
@@ -117,7 +125,11 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
-        """Correct with z; the covariance of z given zeta is bounded over the laws of the modes."""
+        """Correct with z; the covariance of z given zeta is bounded over the laws of the modes.
+
+        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1); `second`: E[y~ y~'] of the signal; `added`: noise and spread
+        of the gains, bounded.
+        """
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
@@ -131,7 +143,10 @@ class UncertainModalFilter(AbstractJointModalFilter):
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing."""
+        """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing.
+
+        zeta: the state times each mode's indicator; `young`: scalar of the bound, by which its nominal part grows.
+        """
         slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
         noise = triangularise(join_columns(WeightedColumns(slopes, young * step.before.gaussian.variances), fresh))
         moved, projection = (slopes, noise), self._projection_to_state()
@@ -148,6 +163,9 @@ def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Arr
 
     Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
     the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
+
+    `rows`: pi_i, the nominal law of the next mode after mode i; `radius`: r, by how much each probability may be off
+    (Delta).
     """
     modes = len(rows)
     difference = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
@@ -158,14 +176,20 @@ def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Arr
 
 
 def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it."""
+    """Return a law between the ends (its sum is 1), and the largest deviation of a possible law from it.
+
+    `low`, `high` (M,): the least and greatest probability of each mode.
+    """
     middle = (low + high) / 2
     middle = middle + (1 - jnp.sum(middle)) / len(low)
     return middle, jnp.maximum(high - middle, middle - low)
 
 
 def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
-    """Return a bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
+    """Return a bound on sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|.
+
+    X_i: symmetric matrices, |X| has the absolute eigenvalues of X; `reach`: by how much p_i may differ from middle_i.
+    """
     values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
     return jnp.einsum("i,iab->ab", middle, matrices) + jnp.einsum("i,iab->ab", reach, sizes)
@@ -177,6 +201,9 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
     diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
     P diag(delta) P is 0 for two modes.
+
+    `low`, `high` (M,): ends of each mode's probability p; `middle`: a law between them, `reach`: the most that p
+    differs.
     """
     modes, (middle, reach) = len(low), _find_middle_law(low, high)
     centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
@@ -188,14 +215,22 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def _bound_next_law(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the least and the greatest probability of every mode one step later, over laws between low and high."""
+    """Return the least and the greatest probability of every mode one step later, over laws between low and high.
+
+    `rows`: nominal transition matrix; `radius`: by how much each entry may be off; `low`, `high`: ends of the present
+    law.
+    """
     least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
     largest_by_mode = jax.vmap(_largest_payoff, (1, None, None))
+    # The least value is minus the largest one of the negative.
     return -largest_by_mode(-least, low, high), largest_by_mode(most, low, high)
 
 
 def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first."""
+    """Return max p payoff over low <= p <= high, sum p = 1: the remaining mass goes to the largest payoffs first.
+
+    `payoff`, `low`, `high` (M,): what each mode is worth, and the ends of its probability p.
+    """
     # earlier[i, j]: i is served before j, by payoff and then by number.
     number = jnp.arange(len(payoff))
     earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))

@@ -37,6 +37,9 @@ class _EntryDegrees(NamedTuple):
 def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequence[int], *rest: np.ndarray) -> bool:
     """Return whether f(x, *rest) is seen to be affine in the entries of x at these places, whatever all others are.
 
+    Each entry has a degree: KNOWN, GIVEN (no dependence on those places), AFFINE in them, or OTHER; they are passed on
+    operation by operation.
+
     Args:
         function: f, in operations of jax.numpy.
         x: a point (n,), by its shape.
@@ -51,7 +54,10 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequenc
 
 
 def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
-    """Return the degrees of a program's results, operation by operation."""
+    """Return the degrees of a program's results, operation by operation.
+
+    A degree says how an entry depends on the arguments: known, given, affine, or otherwise.
+    """
     values = dict(zip(program.jaxpr.invars, arguments, strict=True))
     values.update(zip(program.jaxpr.constvars, map(_trace_known_array, program.consts), strict=True))
 
@@ -139,6 +145,8 @@ def _degree_of_contraction(a: _EntryDegrees, b: _EntryDegrees, dimensions: Any) 
 
     A product with a known zero is none. A sum is AFFINE where some product has one AFFINE factor, and OTHER where a
     factor is OTHER or both are AFFINE; else GIVEN. `dimensions`: JAX's numbers of the contracted and batch axes.
+
+    Degrees in their order: KNOWN, GIVEN (whatever it is), AFFINE (in the states asked about), OTHER.
     """
 
     def count(of_a: np.ndarray, of_b: np.ndarray) -> np.ndarray:

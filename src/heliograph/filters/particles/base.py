@@ -106,7 +106,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         """Return the innovation that these sums over all particles say; `density`: log p(z)."""
 
     def compute_estimate(self, state: Any) -> Estimate:
-        """Return the mean and covariance of all particles, by sums over them."""
+        """Return the weighted mean of all particles, and the covariance about it, by sums over them."""
         weight, particles = jax.tree.map(jnp.asarray, (state.weight, self.get_particles(state)))
         sums = self.sum_for_mean(weight, particles)
         return self.estimate_from_sums(sums, self.sum_for_covariance(weight, particles, sums))
@@ -114,7 +114,11 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     def compute_innovation(
         self, weight: jax.Array, predicted: tuple[jax.Array, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean, its covariance and the log-likelihood, by sums over what particles (N,) expect."""
+        """Return z less its mean, its covariance and the log-likelihood, by sums over what particles (N,) expect.
+
+        `predicted`: what each particle expects of z; `density`: log p(z). Sums are about the heaviest particle's
+        expectation, so that large numbers keep their digits.
+        """
         number = find_reference_particle(weight, predicted)
         reference = tuple(part[number] for part in predicted)
         received = self.sum_received(reference, weight, predicted, z, k)
@@ -126,7 +130,11 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         return True
 
     def choose_particles(self, log_weight: jax.Array, key: jax.Array) -> ResampledParticles:
-        """Resample systematically where the effective number is too small; else all particles go on as they are."""
+        """Resample systematically where the effective number is too small; else all particles go on as they are.
+
+        It is too small below the share `resample` of all; log weights of resampled particles are 0, of others
+        unchanged.
+        """
         weight = jax.nn.softmax(log_weight)
         too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)

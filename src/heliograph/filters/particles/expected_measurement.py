@@ -34,6 +34,8 @@ class ExpectedMeasurement(NamedTuple):
     def find_innovations(self, weight: jax.Array, predicted: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return weights (B a,) of particles and atoms, and how far their innovations are from the base (B a, m).
 
+        An atom is one of the channel's Gaussians; the base is the innovation of a reference particle's first atom.
+
         Args:
             weight: weights (B,) of particles before z is known, of any sum.
             predicted: their h(x), (B, p); where it is no number they do not count, unless none does.
@@ -46,6 +48,8 @@ class ExpectedMeasurement(NamedTuple):
 
     def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
         """Return mean and covariance of the innovation, and log p(z).
+
+        Atoms are the Gaussians whose mixture is the channel. Covariance: noise within them, and spread of their means.
 
         Args:
             first: first sums of what is apart from the base.
@@ -61,7 +65,10 @@ class ExpectedMeasurement(NamedTuple):
 
 
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
-    """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any."""
+    """Return the number of the heaviest of particles (N,) whose expectations are numbers; of all if none has any.
+
+    `predicted`: what particles expect of z, in several arrays; they are numbers if all are finite.
+    """
     xp = library(weight, predicted)
     finite = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]
     counts = functools.reduce(xp.logical_and, finite) & (weight > 0)

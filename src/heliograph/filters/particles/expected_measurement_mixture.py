@@ -59,7 +59,11 @@ def sum_mixtures(
 
 
 def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array, density: jax.Array) -> Innovation:
-    """Return the innovation's mean, covariance and log-likelihood given what arrived; `density`: log p(z, arrivals)."""
+    """Return the innovation's mean, covariance and log-likelihood given what arrived; `density`: log p(z, arrivals).
+
+    `base`: a reference innovation, about which sums are taken; p(z) given arrivals is p(z, arrivals) over the mean
+    chance of these.
+    """
     present = ~jnp.isnan(z)
     weight = jnp.where(sums.weight > 0, sums.weight, 1.0)
     mean = jnp.asarray(sums.value) / weight

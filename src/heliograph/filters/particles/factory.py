@@ -82,7 +82,7 @@ def build_partly_drawn(
 
 
 def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the places of the drawn states, in the plant's order."""
+    """Return the indices of the drawn states, in the plant's order; of all states for None."""
     if drawn is None:
         return tuple(range(len(start.states)))
     asked = [str(name) for name in items("drawn", drawn, "names of states")]

@@ -64,6 +64,9 @@ def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> 
     """Return the first sums of particles (B,) and modes, and of the weights of modes.
 
     The mean direction is that of E exp(i angle), and an angle's Gaussian has exp(i m - variance / 2).
+
+    Each particle has a Gaussian in each mode (M); first sums are of weights, their squares, means, and angles' sine and
+    cosine. No modes are returned where there is one.
     """
     share, mean = _list_parts(weight, particles)
     variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)
@@ -78,12 +81,15 @@ def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSu
     """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
     share, mean = _list_parts(weight, particles)
     apart = wrap_angles(mean - sums.first.mean(angles), angles)
-    within = particles.gaussian.covariance.reshape(len(share), *2 * mean.shape[1:])
+    within = particles.gaussian.covariance.reshape(len(share), *2 * mean.shape[1:])  # beside the spread of the means
     return second_sums(share, apart) + jnp.einsum("a,aij->ij", share, within)
 
 
 def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Array]:
-    """Return weights (B M,) of particles and modes, and their means (B M, n)."""
+    """Return weights (B M,) of particles and modes, and their means (B M, n).
+
+    A particle has M modes, each with a Gaussian of n states and a log probability.
+    """
     x, log_mode = particles
     share = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()
     return share, jnp.asarray(x.mean).reshape(len(share), -1)

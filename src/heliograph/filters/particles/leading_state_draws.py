@@ -24,26 +24,36 @@ def slopes_given_drawn(
         return function(jnp.concatenate([x.mean[:drawn], others]))
 
     others = x.mean[drawn:]
+    # The rows of L for the others are zero in the drawn states' columns, which have no variance.
     slopes = jax.jacfwd(of_others)(others) @ x.root[drawn:, drawn:]
     return of_others(others), jnp.pad(slopes, ((0, 0), (drawn, 0)))
 
 
 def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
-    """Return x given its leading states, drawn as mean + L sqrt(variance) draw; draw (drawn,) is standard normal."""
+    """Return x given its leading states, drawn as mean + L sqrt(variance) draw; draw (drawn,) is standard normal.
+
+    L: unit triangular factor of x's covariance.
+    """
     drawn = len(draw)
     xi = square_root(x.variances[:drawn]) * draw
     return x._replace(mean=x.mean + x.root[:, :drawn] @ xi, variances=x.variances.at[:drawn].set(0.0))
 
 
 def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
-    """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,)."""
+    """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,).
+
+    `second`: bound of E[d^2], of which rounding is a share.
+    """
     drawn = len(d)
     second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
     return x.variances[:drawn] <= rounding_of_products(drawn, second)
 
 
 def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
-    """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0."""
+    """Return x given its leading states d (drawn,), and log of their density; `certain` ones have none and count 0.
+
+    xi: what each leading state differs by from its mean given those before it; LOG_TURN: log 2 pi.
+    """
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
     variances = jnp.where(certain, 1.0, x.variances[:drawn])

@@ -21,6 +21,7 @@ class FirstSums(NamedTuple):
         """Return the weighted mean (n,), of an angle the mean direction."""
         mean = jnp.asarray(self.value) / self.weight
         for place, i in enumerate(angles):
+            # of weighted sums of sine and cosine
             mean = mean.at[i].set(jnp.arctan2(self.sine[place], self.cosine[place]))
         return mean
 
@@ -33,7 +34,10 @@ class StateSums(NamedTuple):
 
 
 def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
-    """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1."""
+    """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1.
+
+    They are of the weights, their squares and x, and of sine and cosine of the components that are angles.
+    """
     of_angles = x[:, list(angles)]
     square, around = jnp.sum(weight**2), (weight @ jnp.sin(of_angles), weight @ jnp.cos(of_angles))
     return FirstSums(jnp.sum(weight), square, weight @ x, *around)

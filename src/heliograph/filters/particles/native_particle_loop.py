@@ -172,7 +172,7 @@ def _compile_in_place(
 
 
 def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
-    """Return the code of function(filter, *arguments), to be called with the arguments; None if there is none."""
+    """Return the compiled function(filter, *arguments), to be called with the arguments; None without native code."""
     choice = choose_code(function, (filter, *arguments), [False, *differs])
     if choice.code is None:
         return None
@@ -208,11 +208,11 @@ def _sum_for_mean(
     """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
     group = jax.tree.map(jnp.asarray, group)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
-    return _pack_sums(filter.sum_for_mean(group.weight, group.particles)), _pack_sums(received)
+    return _pack_sums(filter.sum_for_mean(group.weight, group.particles)), _pack_sums(received)  # as one vector each
 
 
 def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
-    """Return the second sums of the states of a group of particles, about the means of all."""
+    """Return second sums of a group's states about the means of all particles, of which `states` has the sums."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
     sums = _unpack_sums(states, filter.sum_for_mean, weight, particles)
     second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
@@ -237,7 +237,7 @@ def _pack_sums(sums: PyTree) -> jax.Array:
 
 
 def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
-    """Return the sums that `_pack_sums` made one vector of, like those of a function of these arguments."""
+    """Return the sums that `_pack_sums` joined in one vector, in the form of a function's of these arguments."""
     leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
     parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
@@ -297,7 +297,7 @@ def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...
     """
 
     def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Return the key after a row, and what is drawn for it."""
+        """Return the key after a row, a uniform number by which to choose particles, and keys of noise and proposal."""
         key, choice_key, noise_key = filter.keys_of_prediction(key)
         key, proposal_key = filter.keys_of_correction(key, row)
         return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
@@ -316,6 +316,7 @@ class _ParticleLoop:
     """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
 
     def __init__(self, filter: Any, programs: _ParticlePrograms):
+        """Keep the compiled programs, the memory in which they read and write, and how many particles count."""
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
         self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
@@ -326,7 +327,7 @@ class _ParticleLoop:
         """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
         memory, count = self.memory, self.count
         for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
-            held[:count], held[count:] = new, new[0]
+            held[:count], held[count:] = new, new[0]  # copies of one fill the lanes up
         memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
@@ -369,7 +370,7 @@ class _ParticleLoop:
         if not self.sum**2 / self.square < self.resample * count:
             for held, new in self.pairs:
                 new[...] = held
-            memory.prior[...] = memory.weight
+            memory.prior[...] = memory.weight  # weights before z
             return
         which = resample_concrete_weights(memory.weight[:count], start)
         for held, new in self.pairs:
@@ -381,11 +382,11 @@ class _ParticleLoop:
         self.memory.used[...] = used
         self.programs.advance()
         for held in (*self.held, *self.predicted):
-            held[self.count :] = held[0]
+            held[self.count :] = held[0]  # fills the lanes up
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
-        """Keep what the heaviest particle before z was known expects, of those where it is a number."""
+        """Keep what the heaviest particle before z expects: sums of innovations are taken about it."""
         prior: Any = self.memory.prior
         best: Any = np.argmax(prior)
         if not all(np.isfinite(part[best]).all() for part in self.predicted):

@@ -94,7 +94,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def allocate_particles(self, count: int) -> Any:
-        """Return arrays of so many particles, to be filled."""
+        """Return arrays of so many particles, to be filled: in each mode mean, factors and log probability."""
         modes, n = len(self.initial), len(self.order)
         each: Any = (np.zeros((count, modes, *size)) for size in ((n,), (n * (n - 1) // 2,), (n,), ()))
         mean, lower, variances, log_mode = each
@@ -114,7 +114,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return key, own
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
-        """Return the law of x_0 for the particles of these numbers (B,)."""
+        """Return the law of x_0 for the particles of these numbers (B,), drawn states first, in every mode."""
         start, count, order = list_mode_models(at(self.plant, 0))[0], len(numbers), np.array(self.order)
         x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
@@ -186,7 +186,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
-        """Draw mode and drawn states with z, weight each particle by p(z) p / q, and condition the rest on z."""
+        """Draw mode and drawn states from a law q that knows z, weigh by p(z) p / q, and condition the rest on z."""
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
         weighed = self.weigh_particles(self.get_particles(state), None, None, proposing, z, k)
@@ -223,7 +223,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return WeighedParticles(Cloud(repeat_for_modes(x, modes), certain), log_ratio, tuple(predicted))
 
     def _find_atoms_by_mode(self, z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
-        """Return what arrived, with the atoms of each mode, and with one Gaussian in their place."""
+        """Return z with each mode's atoms (Gaussians of its mixture), and with one Gaussian in their place."""
         gain, offset, noise = jax.vmap(lambda of_mode: of_mode.moments())(atoms)
         return ReceivedByMode(
             z=z,
@@ -295,11 +295,11 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return after, mode, log_density + log_p - log_q
 
     def _prior_share(self, sensors: Sequence[AbstractSensor], received: ReceivedByMode) -> float:
-        """Return the share of particles that are drawn without z."""
+        """Return the share of particles drawn without z: all if not `optimal`, none where drawing with z is exact."""
         if not self.optimal:
             return 1.0
         is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
-        return 0.0 if is_exact else PRIOR_SHARE
+        return 0.0 if is_exact else PRIOR_SHARE  # PRIOR_SHARE: 0.1, which bounds the weights
 
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
@@ -315,7 +315,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def _condition_on_received(
         self, x: Gaussian, slopes: jax.Array, expected: jax.Array, noise: WeightedColumns, z: jax.Array
     ) -> tuple[Gaussian, jax.Array]:
-        """Return x given z = expected + slopes xi + v, and the log density of z."""
+        """Return x = m + L xi given z = expected + slopes xi + v, and the log density of z."""
         value = wrap_near(z - expected, jnp.zeros(len(z)), self.observed_angles)
         after, innovations = condition_on_observation(x, slopes, value, noise, ~jnp.isnan(z))
         return after, innovations.log_density(~jnp.isnan(z), jnp.abs(z) + jnp.abs(expected))
@@ -347,7 +347,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return what a particle expects of z in each mode and atom, to first order in h."""
 
         def expect_in_mode(mode: jax.Array, x: Gaussian) -> tuple[jax.Array, jax.Array]:
-            """Return means (atoms, m) of z and their covariances."""
+            """Return for each atom of the mode's mixture the mean (atoms, m) of z, and its covariance."""
             y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
             spread = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
@@ -367,14 +367,14 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> ReceivedSums:
-        """Return sums of how far innovations of particles (B,), modes and atoms are from that of a reference."""
+        """Return sums over particles (B,), modes and the channel's atoms of innovations less that of a reference."""
         base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
     def innovation_from_sums(
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z less its mean over particles, modes and atoms, its covariance, and log p(z)."""
+        """Return z less its mean over particles, modes and the channel's atoms, its covariance, and log p(z)."""
         return compute_mixture_innovation(
             received, find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles), z, density
         )

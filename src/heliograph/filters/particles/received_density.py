@@ -48,7 +48,11 @@ class ReceivedAtoms(Module):
         both = present[:, None] & present
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
-            """Return log N(z; gain y + offset, noise) of one atom (N,)."""
+            """Return log N(z; gain y + offset, noise) of one atom (N,).
+
+            y (N, p): signals of N particles; `present` (m,): which components of z arrived, `both` (m, m): which pairs;
+            LOG_TURN: log 2 pi. -inf where E z is no number.
+            """
             # z - E z, 0 for what did not arrive and for an E z that is no number.
             expected = y @ gain.T + offset
             valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
@@ -68,7 +72,10 @@ class ReceivedAtoms(Module):
         return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
     def moments(self) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean gain (m, p), mean offset (m,), and the noise's covariance about it (m, m)."""
+        """Return mean gain (m, p), mean offset (m,), and the noise's covariance about it (m, m).
+
+        One Gaussian in place of the atoms: the spread of their offsets counts as noise.
+        """
         weight, offset = jnp.asarray(self.weight), jnp.asarray(self.offset)
         mean = weight @ offset
         noise = jnp.einsum("a,aij->ij", weight, jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset))
@@ -86,7 +93,10 @@ class ReceivedDensity(Module):
     atoms: ReceivedAtoms
 
     def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
-        """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode."""
+        """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode.
+
+        Atoms: the Gaussians of what arrives, by mode and set of arrivals; the chance: of such a set.
+        """
         kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
         chosen: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
         return chosen, jnp.asarray(self.chance)[:, kind]
@@ -126,7 +136,10 @@ def find_received_density(
 
 
 def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineComponent]:
-    """Return the atoms of one set of arrivals; raise unless each has noise in all that arrives."""
+    """Return the atoms of one set of arrivals; raise unless each has noise in all that arrives.
+
+    An atom is one Gaussian of what arrives, given the signal: gain, offset, noise covariance and weight.
+    """
     outputs = len(sensor.outputs)
     received = GainAndNoise(Constant(1.0), np.eye(outputs), sensor.noise)
     try:
@@ -142,7 +155,10 @@ def _list_atoms(sensor: AbstractSensor, outcome: ArrivalOutcome) -> list[AffineC
 
 
 def _check_noise(covariance: np.ndarray) -> None:
-    """Raise ValueError unless every combination of what arrives has noise."""
+    """Raise ValueError unless every combination of what arrives has noise.
+
+    CERTAIN: 1e-14, the eigenvalue of the noise's correlations up to which a combination has no noise.
+    """
     deviation = np.sqrt(np.diagonal(covariance))
     correlation = covariance / np.outer(*[np.where(deviation > 0, deviation, 1.0)] * 2)
     if len(covariance) and not np.min(np.linalg.eigvalsh(correlation)) > CERTAIN:
@@ -151,7 +167,10 @@ def _check_noise(covariance: np.ndarray) -> None:
 
 
 def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
-    """Stack atoms into arrays of `count`, the missing ones of weight zero."""
+    """Stack atoms into arrays of `count`, the missing ones of weight zero.
+
+    An atom is one Gaussian of what arrives. Weights are divided by their sum.
+    """
     filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
     weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
     return ReceivedAtoms(weight=weight / weight.sum(), gain=gain, offset=offset, noise=noise)

@@ -23,6 +23,8 @@ def resample_concrete_weights(weight: np.ndarray, start: float) -> np.ndarray:
 
     Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; and of a j the
     index is the count of those drawn for lower ones alone.
+
+    start in [0, 1): the one random number of systematic resampling.
     """
     count, ends = len(weight), np.cumsum(weight)
     ends *= count / ends[-1]
@@ -39,10 +41,13 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
     by one. Of MANY numbers in all on they are of single precision, two from each 64 bits: those have 2^23 values, at
     most 5.3, and take half of the time, in native code and in XLA's, which agree on them to single precision. Fewer
     are those of `jax.random.normal(key, (particles, size))`, to the last digits in both.
+
+    MANY: 10,000; STEP: 2^-22, between two of the uniform numbers.
     """
     if size * particles < MANY:
         least = np.nextafter(-1.0, 0.0)
         uniform = jnp.maximum(least, 2 * draw_uniforms(key, numbers, size, particles) + least)
+        # Uniform on (-1, 1), of which the inverse error function makes normal numbers.
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
     words = draw_random_bits(key, numbers, -(-size // 2), particles)
     halves = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
@@ -74,7 +79,10 @@ def effective_number(weight: jax.Array) -> jax.Array:
 
 
 def fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
-    """Return the key made of another one and of the bits of a measurement."""
+    """Return the key made of another one and of the bits of a measurement.
+
+    So the same filter draws otherwise after other data; a missing number counts as 0.
+    """
     bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
     for word in bits.ravel():
         key = jax.random.fold_in(key, word)

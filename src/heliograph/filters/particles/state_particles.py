@@ -82,13 +82,19 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     @compile_on_call
     def init(self) -> StateParticles:
-        """Draw the particles from the law of x_0."""
+        """Draw the particles from the law of x_0.
+
+        Their log weights are 0 (equal); `moved`: whether a step was predicted.
+        """
         key, own = self.start_keys()
         x = self.draw_start(own, jnp.arange(self.particles))
         return self.make_state(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def make_state(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
-        """Return the state of particles (N, n) with these log weights, of which none is left to draw."""
+        """Return the state of particles (N, n) with these log weights, whose noises were all drawn.
+
+        `law`: of the last move, from which z may still draw again under the optimal proposal; here without spread.
+        """
         size = position.shape[1]
         law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
@@ -99,14 +105,20 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return key, own
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> jax.Array:
-        """Draw x_0 (B, n) of the particles of these numbers."""
+        """Draw x_0 (B, n) of the particles of these numbers.
+
+        Each number has a random key of its own, so that one particle's draw does not depend on how many there are.
+        """
         plant = at(self.plant, 0)
         drawn: jax.Array = jax.vmap(lambda number: plant.sample_initial(jax.random.fold_in(key, number)))(numbers)
         return drawn
 
     @predicts
     def predict(self, state: StateParticles, u: ArrayLike = (), k: Step = 0) -> StateParticles:
-        """Resample where the effective number is too small, then move each particle with a noise of its own."""
+        """Resample where the effective number is too small, then move each particle with a noise of its own.
+
+        `law`: of that move, which a proposal that knows z uses; None where it does not.
+        """
         key, choice, own = self.keys_of_prediction(state.key)
         which, log_weight = self.choose_particles(state.log_weight, choice)
         position, law = self.move_particles(state.position[which], None, own, jnp.asarray(u), k, state.moved)
@@ -119,7 +131,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def move_particles(
         self, x: jax.Array, numbers: jax.Array | None, key: jax.Array, u: jax.Array, k: Step, moved: jax.Array
     ) -> tuple[jax.Array, MoveLaw | None]:
-        """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it."""
+        """Move particles x (B, n) with noises of their own; return with them the law of the move, if z is to use it.
+
+        `numbers`: of the particles, None for all; the law has centers, root of the noise's covariance and draws.
+        """
         plant = at(self.plant, k)
         center = jax.vmap(lambda one: plant.transition(one, u))(x)
         if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
@@ -135,6 +150,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
 
         So a first measurement that is far more precise than x_0 leaves more than few of the particles.
+
+        `law`: of the move (center, root of the noise's covariance, draws), from which z may draw again; `moved`: not
+        the first step.
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
@@ -149,7 +167,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
-        """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z."""
+        """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z.
+
+        `density`: log p(z); a row that no particle explains is not used. `law`: of the last move, for drawing anew.
+        """
         z = jnp.asarray(z)
         key, proposing = self.keys_of_correction(state.key, z)
         weighed = self.weigh_particles(state.position, state.law, None, proposing, z, k)
@@ -171,6 +192,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
 
         They expected h(x) before z was known (B, p).
+
+        `correction`: log of the law of the move over that of the draw. `numbers`: of the particles, None for all.
         """
         sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
         predicted = received = jax.vmap(sensor.measure)(position)
@@ -190,7 +213,11 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
-        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference."""
+        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference.
+
+        Both: of first and of second order. Atoms: the Gaussians whose mixture the channel is; `predicted`: what
+        particles expect.
+        """
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         both, apart = expected.find_innovations(weight, *predicted)
         return first_sums(both, apart, ()), second_sums(both, apart)
@@ -203,7 +230,10 @@ class StateParticleFilter(AbstractStateParticleFilter):
         k: Step,
         density: jax.Array,
     ) -> Innovation:
-        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood."""
+        """Return z less its mean over particles and atoms, the covariance of these, and the log-likelihood.
+
+        `received`: first and second sums of innovations about that of the `reference` particle; `density`: log p(z).
+        """
         first, second = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
         return expected.compute_innovation(first, second, density)

@@ -41,7 +41,10 @@ class LinkOfBits(Module):
     flag: int | None = eqx.field(static=True)
 
     def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
-        """Return the probabilities of the combinations given what was told; all modes alike where nothing was."""
+        """Return the probabilities of the combinations given what was told; all modes alike where nothing was.
+
+        `flag`: output at which the mode is told, None without modes; weights (modes, combinations of error rates).
+        """
         weights = jnp.asarray(self.weights)
         if self.flag is None:
             return weights[0]
@@ -84,7 +87,10 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
 
 
 def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """Return the channel, without what is told, in each mode of its chain, where this is told last; else nothing."""
+    """Return the channel, without what is told, in each mode of its chain, where this is told last; else nothing.
+
+    A word is a number sent in bits; a channel tells the mode of its chain with an output of its own, a flag.
+    """
     parts = channel.in_parallel
     flags = [part for part in parts if isinstance(part, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
@@ -103,7 +109,10 @@ def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
 
 
 def _fix_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
-    """Return a map in one mode of its chain."""
+    """Return a map in one mode of its chain.
+
+    A link without modes is kept, with the links within it fixed.
+    """
     if isinstance(link, Modes):
         return link.given(mode)
     return replace_inner_maps(link, [_fix_mode(inner, mode) for inner in inner_maps(link)])

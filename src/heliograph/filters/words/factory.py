@@ -40,7 +40,10 @@ class WordAlphabet(NamedTuple):
 
 
 def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
-    """Return the words of an encoder, or of a sensor that reports multiples of its resolution."""
+    """Return the words of an encoder, or of a sensor that reports multiples of its resolution.
+
+    A word is a number rounded to steps, sent in bits. `bits` 0: of a sensor's resolution, without an end of the range.
+    """
     m = len(sensor.outputs)
     rounded = find_rounded_noises(sensor)
     if encoder is not None:
@@ -59,13 +62,18 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
     """Return the sensor with the noise that it has before it rounds."""
     if not isinstance(sensor.noise, RoundedNoise):
         return sensor
+    # A copy with another noise: modules are frozen, so it is set past that.
     twin = copy(sensor)
     object.__setattr__(twin, "noise", sensor.noise.source)
     return twin
 
 
 def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
-    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over."""
+    """Return the second moments of the words that arrive as numbers about their centres, modes averaged over.
+
+    A word is a number sent in bits, its centre the middle of the range. Outputs that tell a mode are no words; moments
+    are those given that the words arrive.
+    """
     words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
     link = words[0] if len(words) == 1 else Stack(words)
     numbers = link if encoder is None else rewrite_about_centres(encoder, link)

@@ -56,12 +56,15 @@ def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is smooth in c from -1 to 1.
 
+    POWERS: coefficients of the polynomial in c; CENTRE: K, 3.75.
+
     Source: Shepherd and Laframboise, Chebyshev approximation of (1 + 2 x) exp(x^2) erfc x (1981), in powers of c.
     """
     x = a * np.sqrt(0.5)
     falling = jnp.exp(-x * x)
     reciprocal = 1 / ((x + CENTRE) * (1 + 2 * x))
     c = (x - CENTRE) * (1 + 2 * x) * reciprocal
+    # Horner's rule.
     ratio = jnp.full_like(a, POWERS[-1])
     for power in POWERS[-2::-1]:
         ratio = ratio * c + power
@@ -81,7 +84,10 @@ def step_without_dither(a: jax.Array, width: jax.Array) -> LikelihoodStep:
 
 
 def smooth_step_by_uniform(a: jax.Array, width: jax.Array) -> LikelihoodStep:
-    """Return a step by a uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, Q and phi."""
+    """Return a step by a uniform dither of width D: differences over D of I(a) = E(t - a)+ = phi - a Q, Q and phi.
+
+    A step is a likelihood that rises from 0 to 1 at a; t is standard normal, Q its tail, phi its density.
+    """
     low, high = a - width / 2, a + width / 2
     (q_low, p_low), (q_high, p_high) = (signed_tail_and_density(x) for x in (low, high))
     return LikelihoodStep(

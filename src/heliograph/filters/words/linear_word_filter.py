@@ -58,7 +58,10 @@ class LinearWordsFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the words that arrived, as numbers."""
+        """Correct with the words that arrived, as numbers.
+
+        The received row has the words and then their dithers, which are known numbers.
+        """
         after, innovation = self.base.correct(state, self._convert_words_to_numbers(jnp.asarray(z)), k)
         # Dithers have no innovation.
         dithers = self.received - len(self.centres)
@@ -71,7 +74,11 @@ class LinearWordsFilter(AbstractWrapper):
         return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
 
     def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
-        """Return q' - c - E[g] d of the received words and dithers, E[g] of the mode that was told."""
+        """Return q - c - E[g] d of the received words q and dithers d, with E[g] of the mode that was told.
+
+        c: the words' centres; a dither was added before rounding, and is taken off times the mean gain. `flag`: index
+        of the number that tells the mode, None without modes.
+        """
         values = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
             return values
@@ -139,7 +146,10 @@ def build_behind_words(
 
 
 def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) -> None:
-    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already."""
+    """Raise ValueError where the dither has no law behind gains that remember, or the sensor rounds already.
+
+    The law of a dither's error is not known where a gain depends on the past (`fades_with_memory`).
+    """
     if encoder.dither in ("stochastic", "subtracted") and fades_with_memory:
         expected = 'dither="triangular" (or "none"), or modes with one error rate each, told last (hg.model.with_flag)'
         raise fail("encoder behind a channel that remembers", expected, repr(encoder.dither))
@@ -155,7 +165,11 @@ def _claim_despite_overload(overload: Overload) -> Claim:
 
 
 def _add_rounding_noise(sensor: LinearSensor, encoder: Words, gaussian: bool, matters: bool) -> LinearSensor:
-    """Return the sensor of y - c whose noise has the error of rounding."""
+    """Return the sensor of y - c, c the centre of the words, whose noise has the error of rounding to words.
+
+    `gaussian`: y is Gaussian, so that the error's variance is known, not bounded; `matters`: its second moment enters
+    the claim, as behind a random gain.
+    """
     m = len(sensor.outputs)
     step, centre, high = (encoder.each(end, m) for end in (encoder.step, encoder.centre, encoder.high))
     noise = RoundedNoise(
@@ -177,6 +191,7 @@ def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
 
 def _mean_gains(numbers: Channel) -> np.ndarray:
     """Return E[g] of each output of a channel of numbers: its row sums, as each output carries one word."""
+    # `numbers`: the channel of the values that words stand for.
     steps = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(numbers)]
     if any(not np.array_equal(step, steps[0]) for step in steps):
         raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
@@ -184,7 +199,10 @@ def _mean_gains(numbers: Channel) -> np.ndarray:
 
 
 def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:
-    """Return whether what the sensor measures is Gaussian before any data."""
+    """Return whether what the sensor measures is Gaussian before any data.
+
+    So it is where the initial law and all noises of plant and sensor are Gaussian.
+    """
     laws: list[object] = [first(plant).deviation]
     laws += [step.noise for step in unstack(plant)] + [step.noise for step in unstack(sensor)]
     return all(isinstance(law, Gaussian) for law in laws if isinstance(law, AbstractNoise))

@@ -105,7 +105,11 @@ def _sum_blocks(
     ratio_change = jnp.exp(-(2**MERGED) * width**2 / wide)  # of r, from block to block
 
     def add_block(carried: Carried, block: jax.Array) -> tuple[Carried, None]:
-        """Add one block: three polynomials in r by Horner's rule, and their terms about the block's first cell."""
+        """Add one block: three polynomials in r by Horner's rule, and their terms about the block's first cell.
+
+        Closed over: `coefficients` of the polynomials by cell of a block (2^MERGED cells), `pairs` the likelihoods of
+        bits, `number` of the first block, `width` w of a cell; r is `ratio`, v the variance of prior and cell together.
+        """
         sums, density, ratio, a = carried
         inside = coefficients[-1]
         for row in range(2**MERGED - 2, -1, -1):
@@ -128,6 +132,8 @@ def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
     """Return the likelihoods of the bits from number `count` on (bits, 2), filled with bits that are surely zero.
 
     By shifts of 1, 2, 4, ... as the binary digits of `count` say, which is known at run time only.
+
+    Pairs (bits, 2): likelihoods that a bit was sent as 0 and as 1, the lowest first.
     """
     shifted, rest, step = pairs, count, 1
     while step < len(pairs):
@@ -139,7 +145,11 @@ def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
 
 
 def sum_overloads(pair: jax.Array, grid: WordGrid, prior: SignalPrior) -> LikelihoodSums:
-    """Return the sums over y beyond both ends of the range, where all bits are zeros or ones."""
+    """Return the sums over y beyond both ends of the range, where all bits are zeros or ones.
+
+    `pair` (bits, 2): likelihoods of each bit's 0 and 1; t = (y - mean) / deviation; an overload begins half a step
+    beyond an end.
+    """
     ends = jnp.array([0.0, 2.0**grid.bits - 1])
     outwards = jnp.array([-1.0, 1.0])
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation

@@ -58,6 +58,8 @@ class Overload(NamedTuple):
     def describe(self, node: str, filter: str) -> str:
         """Return a line that says how often words are overloaded, and what that may do to the claim of a filter.
 
+        A word is overloaded if its number lies beyond the range; `bound`: share of the rms error.
+
         Args:
             node: name of the sender's node.
             filter: name of the filter.
@@ -137,7 +139,10 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
 def _find_models_of_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
-    """Return motion, sensing and link at a step; those of step 0 where nothing varies."""
+    """Return motion, sensing and link at a step; those of step 0 where nothing varies.
+
+    `links`: moments of the link at each step, None where there is none.
+    """
     return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), None if links is None else links[k]
 
 
@@ -157,7 +162,10 @@ def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
 
 @cache_by_object
 def _find_sensing(sensor: LinearSensor) -> Sensing:
-    """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error."""
+    """Return C, the mean of y - c - C x, Cov v and the covariance of the rounding error.
+
+    y = C x + noise, c the centre of the words. Rounding error: what the noise's covariance has beside the sensor's own.
+    """
     law = sensor.noise
     assert isinstance(law, RoundedNoise)
     source = np.asarray(law.source.covariance)
@@ -237,7 +245,11 @@ def _bound_error(
 
 
 def refuse_overload(overload: Overload) -> None:
-    """Raise ValueError where words are overloaded more often than once in a thousand steps."""
+    """Raise ValueError where words are overloaded more often than once in a thousand steps.
+
+    A word is overloaded if its number lies beyond the range. MOST: 1e-3; `bound`: share of the rms error, infinite if
+    there is none.
+    """
     worst = float(np.max(overload.probability))
     if worst > MOST:
         bound = float(overload.bound)

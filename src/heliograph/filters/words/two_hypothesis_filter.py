@@ -73,7 +73,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: Hypotheses, u: ArrayLike = (), k: Step = 0) -> Hypotheses:
-        """Predict both Gaussians."""
+        """Predict the Gaussians of both hypotheses: that the last words were right in their leading bits, or not."""
         plant, size = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
         move = partial(predict_gaussian, plant, self.base.transform, u=jnp.asarray(u), start=size)
         return state._replace(parts=jax.vmap(lambda part: move(x=part))(state.parts))
@@ -85,7 +85,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         words = base.identify_received_words(z, at(base.links, k))
 
         def append_measured(part: Gaussian) -> Gaussian:
-            """Return the joint law of the state and what is measured, under one hypothesis."""
+            """Return the joint law of the state and what is measured, under one hypothesis.
+
+            `base`: the filter of one Gaussian; a hypothesis: that the last words were right, or not.
+            """
             signal = base.predict_signal(part, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
             return append_rows(part, signal.mean, signal.slopes, noise)
@@ -116,6 +119,9 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """Condition one hypothesis on word i, and on each answer to whether its leading bits are right: yes, no.
 
         Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,).
+
+        A hypothesis: that the last words were right, or not. LEADING: 3 bits; SURE: 1e-10, the share of probability
+        below which an answer is impossible. `row`: of y_i, in the root of the law of state and signal.
         """
         row = part.root[len(self.states) + i]
         prior = self.base.find_signal_prior(part, i)
@@ -154,7 +160,11 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         four_parts = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), parts)
 
         def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
-            """Merge the chosen of the four parts; return their probability too. Without any, merge all."""
+            """Merge the chosen of the four parts; return their probability too. Without any, merge all.
+
+            The parts: two hypotheses on the words before, times two answers on this one; `mass`: their probabilities
+            (2, 2), `total` the sum.
+            """
             chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
             probability = jnp.sum(chosen_mass)
             shares_of_all = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)

@@ -162,6 +162,7 @@ class WordFilter(AbstractGaussianStateFilter):
         if_right = jnp.where((bits >= self.bits - leading)[:, None], as_received, 1.0)
         # Both answers from the same sums, over all words and over those that are right: not right is all less right.
         all_and_right = [*pairs, *(pair * if_right for pair in pairs)]
+        # Weights of the sums over all words, and then of those over the right ones.
         right, wrong = jnp.append(0 * words.weights, words.weights), jnp.append(words.weights, -words.weights)
         weights = jnp.stack([right, wrong])
         return find_effect_of_bits(
@@ -169,7 +170,11 @@ class WordFilter(AbstractGaussianStateFilter):
         )
 
     def _find_effect_of_word(self, i: int, words: "ReceivedWords", prior: SignalPrior) -> WordEffect:
-        """Return what the received word of y_i says of it: log probability, shift of the mean, ratio of variances."""
+        """Return what the received word of y_i says of it: log probability, shift of the mean, ratio of variances.
+
+        `certain`: no bit can flip, so that y_i lies in the word's cell; else likelihoods of bits are summed over all
+        words.
+        """
         grid = self._word_grid(i, words)
         if self.certain:
             return find_effect_of_cell(words.numbers[i], grid, prior, self.dither)
@@ -233,7 +238,10 @@ class ReceivedWords(NamedTuple):
 
 
 def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
-    """Return presence, number and dither of the first copy that came; zeros of none."""
+    """Return presence, number and dither of the first copy that came; zeros of none.
+
+    Copies are tuples of these three; from the last to the first, so that the first one that came stays.
+    """
     chosen = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
     for came, number, d in reversed(copies):
         chosen = came | chosen[0], jnp.where(came, number, chosen[1]), jnp.where(came, d, chosen[2])

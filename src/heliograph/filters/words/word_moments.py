@@ -41,6 +41,8 @@ def sum_by_edges(
     M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
 
     Shapes: t (edges,), jumps (..., edges), at_zero (...), of several likelihoods at once.
+
+    t: a standard normal y; Q: its tail, phi: its density, J: a jump. LEAST: least width that changes anything.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
     step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
@@ -109,6 +111,9 @@ def sum_words_near_prior(
     """Return the sums M, E[t L], E[t^2 L] over words within the prior's reach, and the one that was received.
 
     Arguments are those of `find_effect_of_bits`.
+
+    t = (y - mean) / deviation. WINDOW blocks of 2^BLOCK words; REACH: 8.5 deviations, beyond which there is no
+    probability.
     """
     count = WINDOW * 2**BLOCK
     start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
@@ -123,12 +128,17 @@ def sum_words_near_prior(
 def sum_one_word(
     likelihood: jax.Array, index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere."""
+    """Return the sums M, E[t L], E[t^2 L] of a likelihood that is this number in the cell of one word, 0 elsewhere.
+
+    t = (y - mean) / deviation; BEYOND_ALL: 40 deviations, in place of infinity. SMOOTH: the form of the edges by kind
+    of dither.
+    """
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
     if grid.bits:  # overloads: the end words have one edge, the other one is BEYOND_ALL deviations away
         t = jnp.where(jnp.array([True, False]) & (index <= 0), -BEYOND_ALL, t)
         t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
+    # Up at the lower edge and down at the upper one; L(0) counts if 0 lies between.
     jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
     at_zero = likelihood * ((t[0] < 0) & (t[1] >= 0))
     return sum_by_edges(t, jumps, at_zero, grid.step / prior.deviation, SMOOTH[dither])
@@ -143,7 +153,10 @@ class WordEffect(NamedTuple):
 
 
 def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
-    """Return the moments from the sums; log M is -inf where it is less than the smallest number."""
+    """Return the moments from the sums; log M is -inf where it is less than the smallest number.
+
+    Sums M = E L, E[t L], E[t^2 L] of a likelihood L give log M, the mean of t, and its variance.
+    """
     possible = sums.mass > np.finfo(float).tiny
     mass = jnp.where(possible, sums.mass, 1.0)
     shift = sums.first / mass
@@ -162,7 +175,11 @@ def remove_dither(change: WordEffect, wide: jax.Array) -> WordEffect:
 
 
 def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str) -> WordEffect:
-    """Return what the word of number `index` does to y, where no bit can have flipped."""
+    """Return what the word of number `index` does to y, where no bit can have flipped.
+
+    ADDED: variance of a dither, in squared steps, 0 for one that is taken off. FINE: least width of a step that is not
+    small; FAR: deviations from which edges have no digits.
+    """
     wider, wide = widen_by_dither(prior, grid, dither)
     cut = remove_dither(_cut_to_cell(index, grid, wider), wide)
     if not ADDED[dither]:
@@ -221,7 +238,11 @@ def find_effect_of_bits(
         return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
     def sum_fine_words() -> WordEffect:
-        """Sum over cells of several words each, and over the overloads beyond the ends."""
+        """Sum over cells of several words each, and over the overloads beyond the ends.
+
+        `pairs`: likelihoods of bits for each law of the link, `weights` the laws' probabilities. The dither's variance
+        widens the prior, and is removed after.
+        """
         wider, wide = widen_by_dither(prior, grid, dither)
         sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
         merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))

@@ -45,6 +45,7 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
     """
     rest, likelihood = numbers, jnp.ones(numbers.shape)
     for zero, one in pairs:
+        # The lowest binary digit is 1 where the rest is odd.
         half = jnp.floor(rest / 2)
         likelihood = likelihood * jnp.where(rest > 2 * half, one, zero)
         rest = half
@@ -52,7 +53,10 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
 
 
 def tabulate_likelihoods(pair: jax.Array) -> jax.Array:
-    """Return the likelihoods of all words, the product of those of their bits (2^bits,)."""
+    """Return the likelihoods of all words, the product of those of their bits (2^bits,).
+
+    `pair` (bits, 2): likelihoods of a zero and a one of each bit, the lowest first.
+    """
     table = jnp.ones(1)
     for bit in range(len(pair)):
         table = jnp.concatenate([table * pair[bit, 0], table * pair[bit, 1]])

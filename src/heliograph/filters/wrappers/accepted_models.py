@@ -30,7 +30,10 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_limited(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter of a plant without limits, and put limits around it where the plant has some."""
+        """Make the filter of a plant without limits, and put limits around it where the plant has some.
+
+        `make`: the function that makes the filter; `parameters`: its signature.
+        """
         given = parameters.bind(*args, **kwargs)
         plant = given.arguments.get("plant")
         start = first(plant)
@@ -90,7 +93,11 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_with_told_numbers(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z."""
+        """Make the filter as it is, or a `ToldFilter` of it where the channel reports numbers with z.
+
+        `make`: the function that makes the filter; `parameters`: its signature. A channel may report numbers, such as
+        its gain, with each z.
+        """
         given = parameters.bind(*args, **kwargs).arguments
         channel = given.get("channel")
         # What is no channel reports nothing, and is for `make` to refuse.

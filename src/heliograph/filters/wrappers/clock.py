@@ -85,7 +85,10 @@ class ClockFilter(AbstractWrapper):
 
     @compile_on_call
     def init(self) -> ClockBelief:
-        """Return the belief before any data."""
+        """Return the belief before any data.
+
+        `silence`: steps since each component arrived; `observed`: whether a clock's offset was observable.
+        """
         start = self.base.init()
         # No component counts before it arrives, as after n steps of silence; and no clock has been observed.
         silence = jnp.full(self.received, len(self.states))
@@ -94,7 +97,10 @@ class ClockFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
-        """Predict plant and clocks over step k."""
+        """Predict plant and clocks over step k.
+
+        `silence`: steps since each component arrived.
+        """
         moved = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
             gaussian=moved, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
@@ -127,7 +133,10 @@ class ClockFilter(AbstractWrapper):
         return belief, gaussian_innovation(z, expected, total)
 
     def _mask_estimated(self, observed: jax.Array) -> jax.Array:
-        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not (n,)."""
+        """Return 1 for the states that are estimated, 0 for offset and drift of clocks that are not (n,).
+
+        `offsets`: index of each clock's offset in the state; its drift is the next one.
+        """
         mask = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
             mask = mask.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
@@ -138,6 +147,8 @@ class ClockFilter(AbstractWrapper):
 
         It is where dy/dt, the derivative by its offset, is significant against the uncertainty of the state, and where
         the derivatives by the offset are linearly independent of those by the other states.
+
+        SIGNIFICANT: 9 variances; SHARE: 1e-3, the least independent share. `offsets`: index of each clock's offset o.
         """
         jacobian = jax.jacfwd(observe)
         slopes, curvature = jacobian(state.gaussian.mean), jax.jacfwd(jacobian)(state.gaussian.mean)
@@ -162,7 +173,10 @@ class ClockFilter(AbstractWrapper):
         def move_and_give_gramian_part(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            """Move one step on; the output is one step's part of O'O."""
+            """Move one step on; the output is one step's part of O'O.
+
+            O'O: square of the observability matrix; `observe`: the outputs of a state.
+            """
             x, from_present = carry  # the state at a later step, and its derivatives by the present state
             rows = jax.jacfwd(observe)(x) @ from_present
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
@@ -176,6 +190,9 @@ def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
     """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 of a column of zeros.
 
     R are the correlations (cosines) of the other columns, r those of this column with them; O'O = `square`.
+
+    O: rows of the outputs' derivatives. RANK: 1e-12, the share of the largest eigenvalue below which a direction is
+    none.
     """
     lengths = jnp.sqrt(jnp.diagonal(square))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)

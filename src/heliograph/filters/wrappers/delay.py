@@ -52,7 +52,10 @@ class PartFilter(AbstractWrapper):
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Plan the larger filter, and keep the rows of its plan that belong to the first n states."""
+        """Plan the larger filter, and keep the rows of its plan that belong to the first n states.
+
+        A plan has the filter's matrices for these inputs; its projection takes the plan's mean to states.
+        """
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)
@@ -105,7 +108,10 @@ class RelayLinesFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Move the plant, send the sensor's signal, and receive it at one relay after another."""
+        """Move the plant, send the sensor's signal, and receive it at one relay after another.
+
+        A line holds what a relay received in the last steps.
+        """
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
             state = _receive_into_line(state, link, line)
@@ -167,6 +173,8 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
     """Enlarge the plant by the line of a relay: what it received 0 to `steps` steps ago, `size` numbers each.
 
     The line shifts by one place at each step, and leaves its first place empty for what is received.
+
+    A matrix of shift moves each place's numbers to the next; the line has no noise of its own.
     """
     held = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
@@ -176,8 +184,12 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
 
 
 def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
-    """Build the filter behind relays from `base`, the filter of all lines."""
+    """Build the filter behind relays from `base`, the filter of all lines.
+
+    `lines`: where each relay's line lies in the state of `base`; a line holds what a relay received in the last steps.
+    """
     # Only the moments under known probabilities make the filter optimal.
+    # Links from stage to stage; the last one is in the filter itself.
     links = tuple(second_order(place_on_delay_line(stage)) for stage in channel.stages[:-1])
     if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
@@ -219,7 +231,10 @@ class LateFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
-        """Predict over step k - delay, with the input of that step."""
+        """Predict over step k - delay, with the input of that step.
+
+        `inputs`: those of the last `delay` steps, which the past still needs; before step 0 nothing is predicted.
+        """
         inputs = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])  # of steps k - delay to k
         sent_at = jnp.asarray(k) - self.delay
         moved = self._predict_if_begun(state.base, inputs[0], sent_at)
@@ -232,7 +247,10 @@ class LateFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
-        """Correct with what was sent at step k - delay; values received before the first signal say nothing."""
+        """Correct with what was sent at step k - delay; values received before the first signal say nothing.
+
+        The state stays as it is then, with log-likelihood 0.
+        """
         sent_at = jnp.asarray(k) - self.delay
         after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
         base = jax.tree.map(lambda new, old: jnp.where(sent_at >= 0, new, old), after, state.base)
@@ -296,7 +314,7 @@ class KnownDelayFilter(AbstractWrapper):
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct with the channel of the received delay; without a delay nothing is used."""
-        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
+        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]  # the last number
         is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
         channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
@@ -327,6 +345,7 @@ def build_behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, ma
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, RelayedLinks):
         return _build_behind_relays(plant, sensor, channel, make)
+    # Past signals as states, of which only the plant's n are estimated.
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
 
 
@@ -344,7 +363,7 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
     larger, past_signals, _ = with_past(plant, sensor, channel)
-    links = [channel.given(d) for d in range(channel.past + 1)]
+    links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
     base, start = make(larger, past_signals, links[0]), first(plant)
     return KnownDelayFilter(
         base=base,
@@ -363,5 +382,6 @@ def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     """Return the channel as if nothing were late: the present signal stands on every place of its delay line."""
     check_maps("channel", [channel])
     if isinstance(channel, RelayedLinks):
+        # First repeat the signal on all places, then take it from the line as the channel does.
         return Series([_deliver_at_once(stage) for stage in channel.stages])
     return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), place_on_delay_line(channel)])

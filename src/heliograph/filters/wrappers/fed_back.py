@@ -132,7 +132,7 @@ class FedBackFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
-        """Correct with the measurement of y - r."""
+        """Correct with the measurement of y - r, r the reference that the sender subtracts from its signal y."""
         base = self.base
         plant, sensor = at(base.plant, k), at(base.sensor, k)
         y = find_signal_moments(

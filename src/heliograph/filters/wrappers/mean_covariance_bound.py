@@ -92,7 +92,10 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     modes = len(told.initial)
 
     def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
-        """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero."""
+        """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero.
+
+        P: covariance in `prior`; `numbers` a: what the message tells, at the rows `filter.numbers` of z.
+        """
         z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
         after: LinearBelief = filter.correct(prior, z, k)[0]
         covariance: jax.Array = after.gaussian.covariance
@@ -106,7 +109,11 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
         def step_in_mode(
             covariance: jax.Array, numbers: jax.Array, weights: jax.Array
         ) -> tuple[LinearBelief, jax.Array]:
-            """Return the prediction, and the mean covariance after it over the numbers that this mode may tell."""
+            """Return the prediction, and the mean covariance after it over the numbers that this mode may tell.
+
+            `numbers` (count, told) and `weights` (count,): what may be told, with probabilities; `state`, `u_k`: of
+            step k.
+            """
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
             after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
@@ -160,7 +167,10 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
 
 
 def _find_quadrature(memory: AbstractMemory) -> tuple[Float[np.ndarray, "nodes told"], Float[np.ndarray, " nodes"]]:
-    """Return numbers that are drawn anew at each step, with their probabilities."""
+    """Return numbers that are drawn anew at each step, with their probabilities.
+
+    Numbers are told with each message: a reading of a gain, one gain itself, or one of finitely many values.
+    """
     if isinstance(memory, FreshReading):
         return reading_quadrature(memory.law, float(memory.variance))
     if isinstance(memory, FreshNumbers) and isinstance(memory.law, AbstractLaw) and memory.count == 1:

@@ -69,7 +69,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct the prediction, its mean held within the limits."""
+        """Correct the prediction, its mean held within the limits; the likelihood of z is that given the limits."""
         after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_within_after, log_within_before = self._log_probability_within(after), self._log_probability_within(state)
@@ -126,7 +126,10 @@ class LimitedFilter(AbstractSizedFilter):
         return self.condition_on_limits(state) if _holds_particles(state) else self._hold_means(state)
 
     def _hold_means(self, state: PyTree) -> PyTree:
-        """Return a filter's state with the means of its Gaussians held within the limits."""
+        """Return a filter's state with the means of its Gaussians held within the limits.
+
+        Within a wrapped state its inner states are held. Particles stay: they are conditioned on the limits instead.
+        """
         if isinstance(state, StateUnderInputs):
             return state._replace(base=self._hold_means(state.base))
         if hasattr(state, "believed"):  # of a gate that may give in to its rival
@@ -218,6 +221,7 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
 def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
     """Return the filter of the plant with limits, from that of the plant without."""
     start = first(plant)
+    # Each with the state's index, low end and high end.
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))

@@ -85,7 +85,10 @@ class ToldFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct by the filter of the law that the numbers of the message give."""
+        """Correct by the filter of the law that the numbers of the message give.
+
+        `numbers`: what the message tells of the link, such as its gain; `values`: what was measured.
+        """
         values, numbers = self._split_message(jnp.asarray(z))
         filter, is_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
@@ -98,6 +101,7 @@ class ToldFilter(AbstractWrapper):
 
         Of the link by the law of its numbers, or of typical ones where that is unknown (`knows_law_of_numbers`).
         """
+        # An expectation is minus the innovation of a measurement of zeros.
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
         return self._place_innovation(filter.correct(state, jnp.zeros(len(self.values)), k)[1])
 
@@ -129,7 +133,10 @@ class ToldFilter(AbstractWrapper):
         return Innovation(value, covariance, innovation.log_likelihood, weight)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter of the law that was told."""
+        """Return the smoother step of the filter of the law that was told.
+
+        A message has values measured and numbers that tell the link's law.
+        """
         values, numbers = self._split_message(jnp.asarray(step.z))
         filter, _ = self._make_filter_given(numbers, step.k)
         return filter.smoother_step(step._replace(z=values))
@@ -146,7 +153,10 @@ class ToldFilter(AbstractWrapper):
 
     @property
     def knows_gain(self) -> bool:
-        """True if no gain is random given what is told, so that innovations of a Gaussian world are independent."""
+        """True if no gain is random given what is told, so that innovations of a Gaussian world are independent.
+
+        ROUNDING: 1e-12, the share of squared gains below which a spread is rounding. It is judged with typical numbers.
+        """
         link = believe_typical(first(self.link))
         if link.remembers:
             return False
@@ -155,7 +165,11 @@ class ToldFilter(AbstractWrapper):
         return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * size**2))
 
     def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":
-        """Return the filter of another plant, sensor and link, told the same numbers; of the same claim."""
+        """Return the filter of another plant, sensor and link, told the same numbers; of the same claim.
+
+        `values`, `numbers`: rows of z with what is measured, and with what is told of the link.
+        """
+        # The filter of a typical law: a message replaces it by its own.
         base = self.make(plant, sensor, at_each_step(believe_typical, link))
         sizes = make_sizes(self.claim, base, self.received)
         return ToldFilter(
@@ -170,7 +184,10 @@ class ToldFilter(AbstractWrapper):
         )
 
     def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return values and numbers of a message; no value where a number is missing that it needs."""
+        """Return values and numbers of a message; no value where a number is missing that it needs.
+
+        Numbers tell the link's law. `_may_be_missing`: which of them are not needed (numbers,).
+        """
         numbers = z[np.array(self.numbers)]
         suffices = ~jnp.isnan(numbers) | self._may_be_missing
         is_usable = jnp.all(suffices | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
@@ -182,11 +199,12 @@ class ToldFilter(AbstractWrapper):
         return jnp.concatenate([jnp.full(m.memory.announced, m.optional) for m in list_told_maps(first(self.link))])
 
     def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
-        """Build the filter of the law that the numbers give, and tell whether they give one.
+        """Build the filter of the link whose law these numbers give, and say whether they give one.
 
         Where a number is missing that must not, it is that of a typical law.
         """
         link = at(self.link, k)
+        # A number that is missing although it is needed is replaced by a typical one, so that the filter can be built.
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
         return self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete)), numbers_give_law(
@@ -195,7 +213,10 @@ class ToldFilter(AbstractWrapper):
 
 
 def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
-    """Return a state with all its real numbers NaN where `spoilt`, else as it is."""
+    """Return a state with all its real numbers NaN where `spoilt`, else as it is.
+
+    A NaN state says that the message gave no law of the link, so that it is refused.
+    """
 
     def spoil(leaf: jax.Array) -> jax.Array:
         """Return NaN in place of real numbers where the state is spoilt."""

@@ -50,6 +50,8 @@ class Graph(NamedTuple):
         """Return parts of the rows, few neighbours first, without the padding that these do not need.
 
         Arithmetic on a row costs by its length, up to its cube, and a graph's longest rows are few.
+
+        FEW: nodes whose rows stay together (64); PARTS: shares of the nodes up to the longest row of each part.
         """
         counts = self.present.sum(axis=1)
         widths = {counts.max()}
@@ -84,7 +86,10 @@ def neighbours_of(value: object) -> dict[str, tuple[str, ...]]:
 
 
 def _list_senders(graph: GraphLike) -> dict[Any, list[Any]]:
-    """Return by node of a graph the nodes from which an edge leads to it; both ends' of an edge without direction."""
+    """Return by node of a graph the nodes from which an edge leads to it; both ends' of an edge without direction.
+
+    `graph`: one of networkx, whose edges are pairs (sender, receiver).
+    """
     pairs = [tuple(pair[:2]) for pair in graph.edges()]
     if not graph.is_directed():
         pairs += [pair[::-1] for pair in pairs]
@@ -149,7 +154,11 @@ def neighbours_within(
 
 
 def graph_of(neighbours: Mapping[str, Sequence[str]], nodes: Sequence[str]) -> Graph:
-    """Return the graph of these nodes by place; each of the neighbours is among them."""
+    """Return the graph of these nodes by place; each of the neighbours is among them.
+
+    Rows (node, degree): the index of each node itself, then of those it receives, then itself as padding, which
+    `present` marks False.
+    """
     index = {name: i for i, name in enumerate(nodes)}
     rows = [[i, *(index[sender] for sender in neighbours[name])] for i, name in enumerate(nodes)]
     degree = max(map(len, rows))

@@ -21,6 +21,9 @@ def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Ar
     """Return M_ij of all neighbours, e_i+ = sum_j M_ij e_j + noise, after that of the node itself.
 
     M_ii = F_i A - sum_j M_ij. `gains` has a leading axis of nodes.
+
+    e_i: error of node i; F_i: what a correction leaves of it; A = `matrix` of the plant. A gain is a front factor times
+    a part.
     """
     parts = gains.parts if gains.parts.ndim == 4 else gains.parts[..., None] * np.eye(len(matrix))
     others = (gains.front[:, None] @ parts)[:, 1:]
@@ -32,7 +35,10 @@ def error_transitions(gains: NodeGains, matrix: Float[Array, "n n"]) -> Float[Ar
 def measurement_weights(
     gain: Float[Array, "node n n"], arrived: Bool[Array, "node degree"]
 ) -> Float[Array, "node degree n n"]:
-    """Return W_i of the measurements that arrived, zero for the others."""
+    """Return W_i of the measurements that arrived, zero for the others.
+
+    W_i: the gain of node i, the same for the measurements of all its neighbours.
+    """
     weights: Float[Array, "node degree n n"] = library(gain, arrived).where(
         arrived[..., None, None], gain[:, None], 0.0
     )
@@ -42,7 +48,10 @@ def measurement_weights(
 def scatter_blocks(
     blocks: Float[Array, "node degree n n"], senders: Int[Array, "node degree"], present: Bool[Array, "node degree"]
 ) -> Any:
-    """Return the matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced."""
+    """Return the matrix (N, N) with these blocks at (node, sender) where present, sparse unless it is traced.
+
+    `senders`: index of each neighbour in a node's row, the node itself as padding (not `present`). N: nodes times n.
+    """
     nodes, _, n, _ = blocks.shape
     if is_traced(blocks):
         # Padding adds zeros at the node itself.

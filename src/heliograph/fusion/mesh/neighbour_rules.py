@@ -51,7 +51,10 @@ class TraceIntersection(AbstractIntersection):
         self.improvements = check_count("improvements", improvements, 0)
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Return the shares of all of several estimates."""
+        """Return the shares of all of several estimates.
+
+        Shares are larger for smaller traces, to a `power`, and then improved so many times. All estimates are there.
+        """
         traces, all_there = jnp.trace(covariances, axis1=1, axis2=2), jnp.ones(len(covariances), dtype=bool)
         believed = NeighbourEstimates(covariances[0], traces, information, None, all_there)
         return choose_shares_by_trace(believed, self.power, self.improvements)[0]
@@ -99,6 +102,7 @@ class DiffusionWeights(_NeighbourRule):
     given: dict[str, dict[str, float]] | None
 
     def __init__(self, shares: Mapping[str, Mapping[str, float]] | None = None):
+        """Keep the shares by node and sender; None: equal shares of a node and all its neighbours."""
         self.shares, self.given = None, None
         if shares is not None:
             rows = table("diffusion shares", shares, "shares by neighbour")
@@ -161,7 +165,11 @@ class FrozenWeights(_NeighbourRule):
     blocks: Float[Array, "..."]
 
     def placed(self, graph: Graph) -> "FrozenWeights":
-        """Return the rule with the blocks (degree, n, degree, n, row) of the graph's rows."""
+        """Return the rule with the blocks (degree, n, degree, n, row) of the graph's rows.
+
+        Blocks are joint covariances of a node and its neighbours, (nodes, degree, n, degree, n) as given; the axis of
+        rows goes last.
+        """
         width = graph.senders.shape[1]
         if len(self.blocks) != len(graph.nodes) or np.shape(self.blocks)[1] < width:
             raise fail("frozen weights", f"blocks of {len(graph.nodes)} nodes and {width} of each or more",
@@ -177,6 +185,8 @@ class FrozenWeights(_NeighbourRule):
         """Return the weights of many steps by native code, parts and covariances (step, row, ...); None without it.
 
         They depend on what arrives at a step alone, so that a node's blocks are read once for all of them.
+
+        `blocks`: joint covariances of each node and its neighbours, with the nodes along the last axis.
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
@@ -190,7 +200,10 @@ class FrozenWeights(_NeighbourRule):
 def _weigh_neighbours(
     rule: AbstractFusion, joint: Float[jax.Array, "degree n degree n"], arrived: Bool[jax.Array, "step degree"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the parts and covariances (step, ...) of one node's weights."""
+    """Return the parts and covariances (step, ...) of one node's weights.
+
+    `joint`: Cov(e_i, e_j) of the node and its neighbours; `arrived`: which estimates came in each step.
+    """
     degree, n = joint.shape[:2]
     # Rules of best weights read the joint covariance alone.
     believed = NeighbourEstimates(jnp.zeros((n, n)), jnp.zeros(degree), jnp.zeros((degree, n, n)), joint, arrived[0])
@@ -212,6 +225,6 @@ def _check_shares(name: str, row: object) -> dict[str, float]:
     given = table(what, row, "shares by neighbour")
     shares = {sender: float(scalar(what, share, 0.0)) for sender, share in given.items()}
     total = sum(shares.values())
-    if total > 1 + SUM or (name in shares and total < 1 - SUM):
+    if total > 1 + SUM or (name in shares and total < 1 - SUM):  # SUM: rounding
         raise fail(what, "shares that sum to 1", f"{total:g}")
     return shares

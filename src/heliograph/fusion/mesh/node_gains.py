@@ -72,7 +72,10 @@ class NodeGains(NamedTuple):
 
 
 def gains_of(weights: NeighbourWeights, step: NodeStep) -> NodeGains:
-    """Return gains of the step with these weights of the estimates: fuse what was believed, predict once, correct."""
+    """Return gains of the step with these weights of the estimates: fuse what was believed, predict once, correct.
+
+    A gain of an estimate is front times its part; `innovation` F = I - P S is what a correction leaves of an error.
+    """
     a = jnp.asarray(step.matrix)
     predicted = symmetrize(a @ weights.covariance @ a.T + step.noise)
     corrected, innovation = correct_by_information(predicted, jnp.asarray(step.arrived))
@@ -104,6 +107,8 @@ def information_of(
     gain: jax.Array, noise: jax.Array, used: jax.Array
 ) -> tuple[Float[jax.Array, "n m"], Float[jax.Array, "n n"]]:
     """Return H' R^-1 and H' R^-1 H of the components that are used.
+
+    z = H x + v of m components, R = Cov v.
 
     Args:
         gain: H (m, n).
