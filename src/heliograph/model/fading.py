@@ -222,7 +222,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    # Parts of the channel with memories of their own, each over all steps.
+    # The channel as a sum of terms with memories of their own, each as the list of its maps over all steps.
     terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
     constant = not isinstance(channel, OverTime)
     return any(

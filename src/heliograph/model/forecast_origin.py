@@ -48,7 +48,7 @@ class Origin:
     several: bool = False
 
     def has_form_of(self, state: PyTree) -> bool:
-        """Return whether the state has the form of another one, and arrays of its shapes."""
+        """Return whether this origin's state has the same tree structure as another state, and arrays of its shapes."""
         own, other = ((str(form), [np.shape(leaf) for leaf in leaves])
                       for leaves, form in map(jax.tree.flatten, (self.state, state)))  # fmt: skip
         return own == other

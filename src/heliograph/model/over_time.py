@@ -51,10 +51,11 @@ def _list_arrays(tree: object) -> list[PyTree]:
 
 def stack(models: Sequence[T]) -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis."""
-    flat = [jax.tree.flatten(model) for model in models]
+    flat = [jax.tree.flatten(model) for model in models]  # of each: its leaves, and its structure
     if len({_describe_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     pieces = zip(*(leaves for leaves, _ in flat), strict=True)
+    # What is no array is the same in all of them.
     stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
     steps_of_parts: T = jax.tree.unflatten(flat[0][1], stacked)
     return steps_of_parts

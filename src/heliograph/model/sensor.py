@@ -75,7 +75,7 @@ class AbstractSensor(Module):
         return self
 
     def under(self, names: Sequence[str], u: Array) -> "AbstractSensor":
-        """Return the sensor as it is under the inputs u of a plant, whose names these are."""
+        """Return the sensor as it is under the inputs u of a plant, called `names`, of which it may take some."""
         if not self.inputs:
             return self
         places = np.array([list(names).index(name) for name in self.inputs])
@@ -95,8 +95,8 @@ class AbstractSensor(Module):
             raise fail(f"sensor of {name}", "one that depends on no inputs", f"one of {list(self.inputs)}")
 
     def check_states(self, states: int) -> None:
-        """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
-        if self.inputs:
+        """Raise ValueError unless the sensor measures a state of this length and returns as many numbers as outputs."""
+        if self.inputs:  # inputs of 1 stand for any
             _sensor_under_inputs(self, np.ones(len(self.inputs))).check_states(states)
             return
         try:
@@ -302,11 +302,11 @@ def _is_sensor(model: object) -> bool:
 
 
 def _drop_names(model: Any) -> Any:
-    """Return the sensor with outputs called y0, y1, ..., and so all of which it is made."""
+    """Return the sensor with outputs called y0, y1, ..., and so the sensors inside it; what is no sensor as it is."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))
-    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])
+    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])  # a copy, so that it may be changed
     object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
     object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
     return bare

@@ -49,7 +49,11 @@ class StampedSensor(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Return h(x) - o dh/dt; h(x) where the clock is right."""
+        """Return h(x) - o dh/dt: to first order h when the clock, o ahead, showed the time; h(x) for a right clock.
+
+        `states`: how many states h takes; `motion`: their rate of change, a matrix or a function (None: the clock is
+        right); `offset`: the place of o among the states.
+        """
         state = jnp.asarray(x)[: self.states]
         if self.motion is None:
             return self.base.measure(state)

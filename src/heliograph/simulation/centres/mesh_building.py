@@ -51,7 +51,10 @@ def build_mesh(network: Network, name: str) -> Mesh:
 
 
 def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObservations:
-    """Return the measurement models of these nodes of a network, in their order; those without a sensor have none."""
+    """Return the measurement models of these nodes of a network, in their order; without a sensor they measure nothing.
+
+    Nodes of one group of the network have models of one structure, which are stacked.
+    """
     groups: list[ObservationModel | None] = []
     places: dict[str, int] = {}  # of each node among all, group after group
     for names in network.groups:

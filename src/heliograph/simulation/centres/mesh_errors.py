@@ -260,7 +260,8 @@ def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshSt
     `flags`: what arrives (step, node, rounds, degree). `steps`: with the information in each node's measurements.
     """
     count = len(mesh.nodes)
-    # From the last step back: the more exchanges follow, the more nodes' measurements can have come.
+    # From the last step back: the more exchanges follow, the more nodes' measurements can have come. `known`: sparse
+    # (node, node), a one where the data of the column's node reach the row's.
     known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
@@ -280,7 +281,7 @@ def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np
     lossless = mesh.edges.lossless()
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
-    if mesh.needs_joint:
+    if mesh.needs_joint:  # any blocks do, since they matter to gains alone
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, lossless, u, k)
@@ -295,7 +296,7 @@ def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
-    reached = known @ step
+    reached = known @ step  # step: a one where the row's node receives the column's
     reached.data = np.minimum(reached.data, 1)
     return reached
 
@@ -343,9 +344,9 @@ def freeze(
 
 
 def find_mesh(network: Network, fusion: str) -> Mesh:
-    """Return the fusion of this name between neighbours, ready to be stepped; raise where there is none.
+    """Return the fusion of this name between neighbours, ready to be stepped; raise ValueError where there is none.
 
-    Also raises for one of over 2,000 nodes (SPARSE).
+    It raises also for one of over 2,000 nodes (SPARSE), whose joint covariance would not fit in memory.
     """
     instance("network", network, Network, "a Network")
     if not isinstance(fusion, str) or fusion not in network.meshes:

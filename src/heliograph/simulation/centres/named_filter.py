@@ -66,6 +66,7 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
     fused = network.fused[name]
     if isinstance(fused, AbstractFilter):
         names = [f"{node}_{part}" for node in network.names for part in network.nodes[node].received_names]
+        # Nodes without a sensor stand last, and send it nothing.
         return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
     if not fused.rule.uses_reports:
         rule = type(fused.rule).__name__
