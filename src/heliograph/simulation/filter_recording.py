@@ -217,7 +217,10 @@ def _find_times(
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each output of which a filter that weighs what arrives left out most."""
+    """Yield a line for each output of which a filter that weighs what arrives left out most.
+
+    FUSED: the name under which filters of all nodes' measurements stand.
+    """
     for node, filters in record.weighed.items():
         if node == FUSED:
             names = [f"{each}: {name}" for each in record.measurements for name in network.nodes[each].received_names]
@@ -229,7 +232,10 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
 
 
 def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
-    """Return what arrived of reports and between neighbours in each step, by fusion, from what was recorded."""
+    """Return what arrived in each step, by fusion, from recorded `reports`: at a centre, and between neighbours.
+
+    `steps`: number of rows. What was not recorded is taken to arrive if it cannot get lost.
+    """
     reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.read_recorded(name, centre.nodes, reports.get(name), steps)
@@ -304,7 +310,7 @@ def _find_refused_rows(
         task: filters and all else that the recording is filtered with.
         before: rows that were refused already, by node, with the reason.
     """
-    refused, centrally = find_refused_rows(network, outputs)
+    refused, centrally = find_refused_rows(network, outputs)  # by nodes' filters, and by those of all measurements
     filters, u = task.filters, task.u
     if centrally:
         states = find_central_states_before_rows(task, grouped)

@@ -165,7 +165,10 @@ class Network(Module):
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
 
     def _check_links(self) -> None:
-        """Raise ValueError unless sensors and channels fit each other; looked at is one node of each group."""
+        """Raise ValueError unless sensors and channels fit each other.
+
+        One node of each group is checked, since all nodes of a group have models of one structure.
+        """
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
@@ -173,7 +176,7 @@ class Network(Module):
                 find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
-        """Raise unless each fusion fits its nodes, and each central filter all that is received."""
+        """Raise ValueError unless each fusion fits its nodes, and each central filter all that is received."""
         for name, fusion in self.fused.items():
             check_states(f"fused {name!r}", fusion, self)
             if isinstance(fusion, Fusion):
@@ -326,7 +329,7 @@ class Network(Module):
         return write_diagram(self)
 
     def claims(self) -> Claims:
-        """Return the claim of every estimate, by node and filter; fused ones last, under "fused"."""
+        """Return by node and filter what each estimate claims of its covariance; fused ones last, under "fused"."""
         claims: Claims = {name: {} for name in (*self.names, *([FUSED] if self.fused else []))}
         for (node, name), claim in self.claimed.items():
             claims[node][name] = claim
@@ -337,8 +340,8 @@ class Network(Module):
         return tuple(yield_mistaken_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
-        """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""
-        lowered = copy(self)
+        """Return the network whose estimates claim "nominal" at most, as where digits are lost that nothing bounds."""
+        lowered = copy(self)  # without the constructor, which would check all again
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
         for field, value in (
             ("nodes", make_nodes_nominal(self)),

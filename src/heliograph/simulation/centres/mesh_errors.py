@@ -88,7 +88,7 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 
 @quickly_compiled
 def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: all rules share a program."""
+    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: one program for all rules."""
 
     def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         """Draw what arrives at step k: next states of the channels, and flags (node, rounds, degree)."""

@@ -232,7 +232,7 @@ def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
 def _split_losses_from_link(
     channel: AbstractRandomAffine, kinds: type | UnionType = Erasure
 ) -> tuple[Scalar, AbstractRandomAffine]:
-    """Return the probability that a message passes all outer maps of these kinds, and the map inside them."""
+    """Return the probability that a message passes all outer maps of these kinds (losses), and the map inside them."""
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
         arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival

@@ -16,7 +16,10 @@ Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
 
 
 def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
-    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}."""
+    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}.
+
+    Rounded to single precision; of each model only the first such number is named.
+    """
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models_with_calls(network):
