@@ -97,7 +97,7 @@ def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFil
 
 
 def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes, with each filter lowered to nominal that believes another world than its node's."""
+    """Return the nodes, each filter's claim lowered to "nominal" if it was made for other models than the node's."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:

@@ -137,7 +137,7 @@ def run(
 
 
 def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
-    """Warn of what a record shows: no numbers, wide angles, impossible estimates, what filters left out or remark.
+    """Warn of what a record shows: values that are no numbers, wide angles, doubtful estimates, data left out, remarks.
 
     `state`: of all filters after the last row.
     """

@@ -152,7 +152,7 @@ class Network(Module):
         self.claimed = FrozenMapping(find_claims(self))
 
     def _check_nodes(self) -> None:
-        """Raise ValueError unless nodes and filters fit the plant, and names have distinct checksums, for draws."""
+        """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
         kind = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
             if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing

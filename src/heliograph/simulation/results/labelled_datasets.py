@@ -293,7 +293,7 @@ def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
 
 
 def make_name_array(names: Sequence[str]) -> np.ndarray:
-    """Return the names as an array of objects, whatever characters they have."""
+    """Return the names as an array of Python's texts, since one of fixed-length texts would drop final zero bytes."""
     texts = np.empty(len(names), dtype=object)
     texts[:] = names
     return texts

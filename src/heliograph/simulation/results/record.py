@@ -112,7 +112,7 @@ class Record(SavableResults):
         return write_record_html(self)
 
     def with_origin(self, origin: Origin) -> "Record":
-        """Return the same record with the states in which its filters ended."""
+        """Return the same record with the states in which its filters ended, from which more rows can be filtered."""
         changed = copy(self)
         vars(changed)["origin"] = origin
         return changed

@@ -70,7 +70,7 @@ def split_measurements(
 
 
 def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    """Return why the nodes' senders transmitted, by node, from arrays (..., node, m) by number of the nodes' group."""
     return {
         name: np.asarray(node_group)[..., i, :]
         for group, node_group in groups.items()

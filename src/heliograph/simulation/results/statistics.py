@@ -137,8 +137,8 @@ class ErrorStatistics:
         """Return the largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, on runs that did not choose d.
 
         B is the claimed covariance. The even batches choose step and direction, the odd batches measure the ratio
-        there, and the reverse; so the ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
-        not finite.
+        there, and the reverse; so the ratio is not biased by the search. `z` is the excess over 1 in standard errors.
+        NaN where some error or bound is not finite.
 
         Raises:
             ValueError: fewer than 4 runs.

@@ -69,7 +69,7 @@ class _RowWithoutNode(NamedTuple):
 def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
-    """Return each filter's judgement of measurements for these rows, from its states before them.
+    """Return each filter's judgement whether measurements in these rows are plausible, from its states before them.
 
     The last axis: the fields of a Judgement. By native code where there is any, else by XLA.
 

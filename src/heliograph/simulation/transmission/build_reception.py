@@ -48,7 +48,7 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Return the medium of a network's relays, which send in slots."""
+    """Return the medium of a network's relays: how they send to each other in slots, one after another in a step."""
     listeners = {name: i for i, name in enumerate(relays.filters)}
     return SlottedRelays(
         relays=relays,
