@@ -199,6 +199,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
+    # Numbers that the channel tells its receiver beside z are not lost with it.
     def build(links: Sequence[AbstractRandomAffine]) -> Mixture:
         """Return the channel of one step: its link with probability p, else silence."""
         nothing = silent(links[0].outputs, links[0].inputs)

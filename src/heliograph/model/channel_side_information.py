@@ -108,7 +108,7 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
-    """Return a law of numbers, or None; ValueError of anything else."""
+    """Return a law of the numbers that a link tells, or None, as it is; raise ValueError for anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))

@@ -170,7 +170,10 @@ def _mask_covariances(bound: np.ndarray) -> np.ndarray:
 
 
 def _are_definite(covariances: np.ndarray) -> bool:
-    """Return whether P + tol diag(P) has a Cholesky factor for all: then correlations have no eigenvalue below -tol."""
+    """Return whether all matrices P are semidefinite to rounding: whether P + tol diag(P) has a Cholesky factor.
+
+    Then their correlations have no eigenvalue below -tol (DEFINITENESS_TOLERANCE). The matrices are changed in place.
+    """
     places = np.arange(covariances.shape[-1])
     covariances[..., places, places] *= 1 + DEFINITENESS_TOLERANCE
     try:
@@ -183,7 +186,8 @@ def _are_definite(covariances: np.ndarray) -> bool:
 def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
     """Return the mask of the matrices (..., n, n) whose eigenvalues are not below zero, to rounding.
 
-    Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol.
+    Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol
+    (DEFINITENESS_TOLERANCE); where it has none, eigenvalues tell which.
     """
     try:
         np.linalg.cholesky(correlations + DEFINITENESS_TOLERANCE * np.eye(correlations.shape[-1]))
@@ -198,7 +202,8 @@ AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
     """Return one estimate, with the claim "none" where its mean is no number or its covariance is none.
 
-    Several estimates side by side are returned as they are: `claims` says of which theirs holds.
+    Several estimates side by side (a mean of more than one axis) are returned as they are: their property `claims` says
+    of which theirs holds.
     """
     if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or mask_sound_estimates(estimate).all():
         return estimate

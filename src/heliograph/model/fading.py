@@ -181,6 +181,7 @@ def shared(link: Channel, name: str) -> Channel:
     if not held:
         raise fail("shared link", "one with memory, such as gilbert_elliott(...)", "one drawn anew at each step, which "
                    "nodes share by Network.sharing")  # fmt: skip
+    # Copies of the memories with the name; of several with a number behind it.
     twins = {key: m.named(name if len(held) == 1 else f"{name} {i}") for i, (key, m) in enumerate(held.items())}
     return replace_memories(link, twins)
 

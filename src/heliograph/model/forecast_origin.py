@@ -75,6 +75,7 @@ def find_median_spacing(time: np.ndarray) -> float:
     if len(time) < 2:
         return float("nan")
     steps = seconds_between(np.asarray(time))[1:]
+    # Equal steps need no sorting.
     return float(steps[0] if steps.min() == steps.max() else np.median(steps))
 
 

@@ -28,6 +28,7 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
+        # A model's values at all steps: every array inside has the same leading axis, of steps.
         self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:
@@ -112,6 +113,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
         """Return the k-th values of an `OverTime`, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
+        # Only arrays have an axis of steps; what is none is the same at all steps.
         values, rest = eqx.partition(leaf.values, eqx.is_array)
         return eqx.combine(jax.tree.map(lambda v: _take_entry(v, k), values), rest)
 
@@ -119,7 +121,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
 
 
 def _take_entry(values: PyTree, k: PyTree) -> object:
-    """Return values[k], also for a k that is traced."""
+    """Return the entry k of an array along its first axis, also for a k that JAX traces."""
     if isinstance(k, jax.Array):
         return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
     return values[k, ...]  # the dots keep a number an array

@@ -134,7 +134,7 @@ class AbstractPlant(Module):
         return as_real(self.noise(u))
 
     def noise_mean(self) -> jax.Array:
-        """Return the mean of w, (n,)."""
+        """Return the mean of the process noise w, (n,); zero where only a covariance is known of it."""
         if isinstance(self.noise, AbstractNoise | JointNoise):
             return jnp.asarray(self.noise.mean)
         return jnp.zeros(self.initial_mean.shape)
@@ -383,7 +383,7 @@ def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
 
 
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:
-    """Raise ValueError unless a user's function returns an array of `shape`."""
+    """Raise ValueError unless a user's function, `called` with `values`, returns an array of `shape`; it is traced."""
     try:
         got = trace_shape(name, called, *values)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:

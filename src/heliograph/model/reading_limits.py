@@ -93,6 +93,8 @@ class ReadingLimits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
+        # Low and high limits of each of `received` numbers; values that are codes, no readings; and from how many equal
+        # readings in a row a component is stuck (None: runs are not counted).
         pairs = read_intervals(limits, received)
         self.low, self.high = pairs[:, 0], pairs[:, 1]
         codes = read_numbers("invalid values", invalid)

@@ -82,7 +82,10 @@ class AbstractSensor(Module):
         return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
-        """Return the sensor under inputs of 1; raise ValueError unless the plant has the inputs that it needs."""
+        """Return the sensor under inputs of 1, which stand for any; raise ValueError where the plant lacks its inputs.
+
+        `names`: of the plant's inputs.
+        """
         lacking = [name for name in self.inputs if name not in names]
         if lacking:
             expected = f"some of the plant's, {list(names)} (it may have ones that move nothing)"
@@ -235,7 +238,10 @@ class LinearSensor(AbstractSensor):
         )
 
     def check_states(self, states: int) -> None:
-        """Raise ValueError unless the matrix is for states of this length: to trace the function would take long."""
+        """Raise ValueError unless the sensor's matrix has as many columns as the state is long.
+
+        Its shape says so at once; only a matrix that depends on inputs is traced.
+        """
         if self.inputs:
             super().check_states(states)
         elif self.matrix.shape[-1] != states:
@@ -273,7 +279,7 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
     """
 
     def shape(states: int) -> tuple[int, ...] | None:
-        """Return the shape of h for a state of this length, None where h does not take it."""
+        """Return the shape of h(x), h being `measure`, for a state of this length; None where h does not take it."""
         try:
             with jax.enable_x64(True):
                 return tuple(jax.eval_shape(lambda x: jnp.asarray(measure(x)), np.zeros(states)).shape)

@@ -135,6 +135,7 @@ class AbstractTrigger(Module):
             key: random, for rules that draw.
             k: the step.
         """
+        # A reason above 0: the component is sent. What the channel would not lose is present.
         reason, is_present = self.reasons(sender, y, key, k), ~jnp.isnan(z)
         # Components are sent one by one, or all in one message.
         one_by_one = self.region == "each"
@@ -174,7 +175,10 @@ class AbstractThreshold(AbstractTrigger):
         return beyond if self.region == "each" else jnp.full(len(error), jnp.any(beyond))
 
     def check_outputs(self, outputs: int) -> None:
-        """Raise ValueError unless delta is one number, or one for each component of a box."""
+        """Raise ValueError unless delta, the threshold, is one number, or one for each component of a box.
+
+        A ball's radius is one number.
+        """
         if np.ndim(self.delta) and (self.region == "ball" or np.shape(self.delta) != (outputs,)):
             expected = "one number" if self.region == "ball" else f"one number, or {outputs}"
             raise fail("delta of the trigger", expected, f"shape {np.shape(self.delta)}")
@@ -209,6 +213,7 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
+        # The threshold, the rule in words, and after how many silent steps it sends (None: never).
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
@@ -237,6 +242,8 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
+        # The threshold, the rule in words, and after how many silent steps it sends (None: never). Both ends
+        # of the link compute the prediction that y is compared with.
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
@@ -268,6 +275,7 @@ class StochasticTrigger(AbstractTrigger):
         reference: Literal["zero", "prediction"] = "zero",
         losses: Literal["unknown", "known"] = "unknown",
     ):
+        # The weight of the squared error, by which it is drawn whether to send: a positive number or matrix.
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
@@ -290,7 +298,7 @@ class StochasticTrigger(AbstractTrigger):
         return (~arrived).astype(float)[: self.side_information(len(arrived))]
 
     def check_outputs(self, outputs: int) -> None:
-        """Raise ValueError unless the weight is one number or a matrix of so many components."""
+        """Raise ValueError unless the weight of the squared error is one number or a matrix of so many components."""
         if np.ndim(self.weight) and len(self.weight) != outputs:
             raise fail(
                 "weight of the trigger", f"a number, or shape {(outputs, outputs)}", f"shape {self.weight.shape}"
@@ -312,6 +320,7 @@ class Periodic(AbstractTrigger):
     heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
+        # All of y is sent at steps `phase`, `phase` + `period`, ..., whatever its value: the reference plays no part.
         if check_count("phase", phase, 0) >= check_count("period", period):
             raise fail("phase", f"a whole number below the period {period}", phase)
         self.period, self.phase = np.asarray(period), np.asarray(phase)

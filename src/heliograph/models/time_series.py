@@ -38,6 +38,7 @@ class Component(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
+        # One input for each state, which weighs it, or none.
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))

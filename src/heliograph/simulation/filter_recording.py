@@ -169,7 +169,7 @@ def _warn_of_each(lines: Sequence[str]) -> None:
 
 
 def _count_rows(measurements: ArrayLike) -> int:
-    """Return the number of rows of a node's measurements, one of a scalar; raise ValueError where there is none."""
+    """Return the number of rows of a node's measurements: 1 of a single number; raise ValueError where it is 0."""
     steps = len(measurements) if rank("measurements", measurements) else 1  # type: ignore[arg-type]
     if steps == 0:
         raise fail("measurements", "at least one row", "none")

@@ -271,7 +271,7 @@ class Network(Module):
         return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
-        """Return the network of a recording with measurements of these nodes alone: without the relays that lack.
+        """Return the network of a recording with measurements of these nodes alone, without relays that have none.
 
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
@@ -315,7 +315,7 @@ class Network(Module):
 
     @cached_property
     def angles(self) -> dict[str, Angles]:
-        """Places of the angles among what each node receives."""
+        """Places of the angles among the numbers that each node receives, of a channel of all its own `rows`."""
         if self.common is None:
             return {
                 name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()

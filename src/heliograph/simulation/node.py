@@ -315,7 +315,7 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
-    """Raise ValueError for filters that are none, or that do not receive as many components as their node."""
+    """Raise ValueError for objects that are no filters, or that do not receive as many components as their node."""
     for name, filter in filters.items():
         check_type(f"filter {name!r}", filter, AbstractFilter)
         if isinstance(filter, AbstractFilter):

@@ -95,7 +95,7 @@ def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
     if origin is None:  # nothing is before them
         return clock
     last, first = np.asarray(origin.time), clock[0]
-    if last.dtype.kind != clock.dtype.kind or first < last:
+    if last.dtype.kind != clock.dtype.kind or first < last:  # a date and a number, or times that go backwards
         raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
     return np.append(last, clock)
 

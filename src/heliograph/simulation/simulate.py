@@ -151,7 +151,10 @@ def _return_with_warnings(result: Result, network: Network) -> Result:
 
 
 def _warn_beyond_limits(record: Record, network: Network) -> None:
-    """Warn where a true state is beyond the limits that filters believe, which the plant itself does not keep."""
+    """Warn where a simulated state is beyond the limits that the plant states, and filters use.
+
+    A simulation does not enforce them: the plant's transition and noise have to.
+    """
     for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
         x = np.asarray(record.truth)[..., network.states.index(name)]
         beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
@@ -174,7 +177,10 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
 
 
 def _warn_of_numbers_lost_in_float32(network: Network) -> None:
-    """Warn if all numbers of some covariance or matrix of plant and sensors are 0 in single precision."""
+    """Warn if all numbers of some array of plant and sensors, not all 0, are too small for single precision.
+
+    They would count as 0.
+    """
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
     if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
@@ -283,7 +289,7 @@ def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
     """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
     if job.precision == "float64":
         return _simulate_trajectories(job.world, job.inputs, job.key, runs)
-    with jax.enable_x64(False):
+    with jax.enable_x64(False):  # so that JAX computes in single precision
         world, inputs = jax.tree.map(_convert_to_single, (job.world, job.inputs))
         outputs = _simulate_trajectories(world, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)

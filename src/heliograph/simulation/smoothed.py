@@ -255,6 +255,7 @@ def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: Py
     """
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
+    # The smoothed part may be of the last rows alone.
     length = outputs["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(smoothing.network, {"truth": None, **outputs["smoothed"]}, time[-length:])
     return Trajectories().others(filtered, smoothed, smoothing.claims)

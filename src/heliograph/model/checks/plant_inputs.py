@@ -217,7 +217,10 @@ def _evaluate_in_blocks_of_steps(
 def _evaluate_at_steps(
     plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
-    """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
+    """Return the matrices of each function at each step, (steps, n, m), under the inputs u of that step.
+
+    Compiled, for operation by operation is slow.
+    """
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
         """Return what the functions return at step k."""

@@ -164,7 +164,10 @@ def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
 
 
 def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
-    """Return whether two plants' process noises agree, as laws or as functions of the inputs."""
+    """Return whether two plants' process noises agree, as laws, or by covariances as functions of the inputs.
+
+    `order`: of the moments that a filter uses, None for the whole law.
+    """
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         return _same_noise(a.noise, b.noise, order)
     return same_function(a.noise_covariance, b.noise_covariance, (len(a.inputs),))

@@ -85,9 +85,9 @@ class FusionCentre(Module):
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
     def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
-        """Return the step of the errors of filters with these matrices, and the errors' moments after it.
+        """Return the linear maps by which the nodes' errors move in step k, and the errors' moments after it.
 
-        `errors`: moments before step k. `filters`: matrices in the order of the nodes.
+        `errors`: moments before step k. `filters`: matrices of the nodes' filters, in the order of the nodes.
         """
         step = self.compute_error_maps(errors.state_mean, errors.state_covariance, filters, u, k)
         return CentreStep(step, propagate_errors_jointly(errors, step))
@@ -100,6 +100,7 @@ class FusionCentre(Module):
         `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
         """
         plant: LinearPlant = at(self.plant, k)
+        # x+ = A x + shift + w; what is measured of the state after the step depends on its moments there.
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
         return make_error_step(filters, motion, observation)

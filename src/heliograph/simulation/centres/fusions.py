@@ -63,7 +63,10 @@ class StackedFusions(Module):
     angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
-        """Return the quantizers' states before the first step, for a plant of n states; () without quantizers."""
+        """Return the states of the quantizers, by which nodes send estimates in few bits, before the first step.
+
+        () without quantizers; else of each fusion and node, (fusion, node, ...). `n`: number of the plant's states.
+        """
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape

@@ -330,7 +330,7 @@ class Mesh(Module):
     def sum_over_messages(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of the senders whose messages it has.
 
-        `present` (node, degree): which these are.
+        `present` (node, degree): which these are, of `senders`, the nodes that it receives.
         """
         sums: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
         return sums

@@ -285,6 +285,7 @@ def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Return H, the mean matrix from state to what a node receives, and R, its noise's covariance at zero signal."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
+    # The channel's noise: the last entry of the covariance of gains and offset, which a signal of 0 leaves.
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
     return gain @ np.asarray(sensor.matrix), noise
@@ -293,7 +294,7 @@ def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
 def _check_noise_is_regular(where: str, noise: np.ndarray) -> None:
     """Raise ValueError for a measurement without noise in some direction: its information is infinite.
 
-    `where`: the node, for errors. `noise`: R.
+    `where`: the node, for errors. `noise`: the covariance R, judged as correlations; RANK: what counts as 0 of these.
     """
     scale = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
     if np.any(scale == 0) or np.linalg.eigvalsh(noise / np.outer(scale, scale))[0] < RANK:

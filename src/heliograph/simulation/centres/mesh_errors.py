@@ -180,7 +180,7 @@ def _compute_step_when_all_is_measured(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
-    """Return step k without the estimates, with all components measured.
+    """Return all of step k that does not depend on the estimates, such as gains, with all components measured.
 
     Arguments as of `Mesh.compute_step_without_estimates`.
     """
@@ -371,5 +371,5 @@ def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node r
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    arrives: np.ndarray = flags & mesh.edges.present[:, None]
+    arrives: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
     return arrives

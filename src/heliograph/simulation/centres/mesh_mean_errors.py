@@ -129,7 +129,7 @@ def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
 def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
     """Return the mesh with a row for each pattern of each node in place of one for each node.
 
-    `rule`: placed on the nodes, which are the last axis of its arrays.
+    A pattern: which messages reach the node. `rule`: placed on the nodes, which are the last axis of its arrays.
     """
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
     bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])

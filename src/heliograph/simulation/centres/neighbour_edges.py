@@ -270,7 +270,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
-    """Return whether a channel delivers exactly what is sent."""
+    """Return whether a channel delivers exactly what is sent: a gain of I, without offset, noise or random gains."""
     if channel.inputs != channel.outputs:
         return False
     moments = second_order(channel.condition_on_arrival())

@@ -56,6 +56,7 @@ def _linearise_observation(
     """
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean  # E y, y = C x + v
+    # E (y, 1)(y, 1)', of which the random gains and the channel's noise make noise of z.
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.evaluate_center(second, jnp.ones(len(gain), dtype=bool))

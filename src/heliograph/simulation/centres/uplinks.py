@@ -163,7 +163,10 @@ class Uplinks(Module):
         return UplinkDraws(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
-        """Return the delays of a node's reports (steps,); raise at one that its uplink does not have."""
+        """Return the delays in steps of a node's reports (steps,); raise at one that its uplink to the centre lacks.
+
+        `delay` (node, steps): probability of each delay.
+        """
         delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
         if not np.all(np.isin(delays, possible)):

@@ -123,7 +123,7 @@ def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str,
     """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
     every = list_sensors(network)
     for name, node in network.nodes.items():
-        sensors = [node.sensor] if isinstance(node, Node) else every
+        sensors = [node.sensor] if isinstance(node, Node) else every  # others hear what several nodes send
         yield from ((name, label, one, sensors) for label, one in node.filters.items() if one.claim != "none")
     for label, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.claim != "none":

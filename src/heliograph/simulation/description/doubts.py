@@ -242,7 +242,10 @@ def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
 
 
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
-    """Return, by name of the filter, the nodes at which it ignores the memory of their links."""
+    """Return, by name of the filter, the nodes at which it takes a link with memory for one without.
+
+    Memory matters where gains are correlated over time; numbers that a link tells are fixed at typical ones.
+    """
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():
         if not isinstance(node, Node):

@@ -56,7 +56,10 @@ def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
 
 
 def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
-    """Return the arrays that a function of a model holds; none of one that cannot be traced by itself."""
+    """Return the arrays that a function of a model holds, as its trace shows them.
+
+    None of a function that cannot be traced by itself with these arguments.
+    """
     try:
         return [x for x in constants(function, *arguments)[0] if not is_traced(x)]
     except (InputError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):

@@ -134,6 +134,7 @@ def _compute_normalised_square(
     both_present = present[..., :, None] & present[..., None, :]
     filled = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
     errors, sizes = np.where(present, x, 0.0), np.nan_to_num(size)
+    # One matrix after another, whatever the leading axes are.
     squares = _square_distances(filled.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
     return np.asarray(np.where(present.any(axis=-1), np.asarray(squares).reshape(x.shape[:-1]), np.nan))
 

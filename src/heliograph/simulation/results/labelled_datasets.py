@@ -148,7 +148,8 @@ class FilterLabels:
     def fill_field(self, name: str, parts: Iterable[Placed[ArrayLike]]) -> np.ndarray:
         """Return the array of a field with these parts at their places along node, or node and filter; NaN elsewhere.
 
-        A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
+        A part that is shorter than its axis, as measurements of a node may be, fills the beginning. `rows`, `lengths`:
+        lengths of the axes of rows, and of all further ones.
         """
         sizes = {"node": len(self.nodes), "filter": len(self.filters), "state": len(self.states)}
         sizes |= {"other": len(self.states), **self.rows, **self.lengths}

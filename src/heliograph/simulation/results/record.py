@@ -303,7 +303,7 @@ class Record(SavableResults):
         return cls(**read_frame(frame))
 
     def apart(self) -> list[str]:
-        """Return the names of the parts that are saved separately."""
+        """Return the names of the parts that `save` leaves out of a file, and that are saved separately."""
         return super().apart() + [
             name for name in ("reports", "transmissions", "weighed", "refused") if getattr(self, name)
         ]

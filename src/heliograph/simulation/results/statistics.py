@@ -111,10 +111,10 @@ class ErrorStatistics:
         """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
         self._warn_of_failures()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
-        return np.sqrt(np.where(variance >= 0, variance, np.nan))
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))  # NaN of what is no variance
 
     def rmse_over_time(self) -> np.ndarray:
-        """Return the root mean squared error at each step, (time,)."""
+        """Return the root of the mean over runs of the squared error of all states, at each step, (time,)."""
         self._warn_of_failures()
         rmse: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
         return rmse
@@ -284,6 +284,7 @@ def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, 
     unit = np.where(of_b > 0, of_b, np.where(of_a > 0, of_a, 1.0))
     scale = unit[..., :, None] * unit[..., None, :]
     eigenvalues, vectors = np.linalg.eigh(b / scale)
+    # W: B's eigenvectors over the roots of its eigenvalues, those of zero taken as rounding.
     whitening = vectors / np.sqrt(np.maximum(eigenvalues, np.finfo(float).eps))[..., None, :]
     values, rotated = np.linalg.eigh(np.swapaxes(whitening, -1, -2) @ (a / scale) @ whitening)
     return values, (whitening @ rotated) / unit[..., None]

@@ -51,7 +51,7 @@ class NetworkStep(Module):
         self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """Step all filters, without implausible measurements: return their next states and the outputs.
+        """Return all filters' states after step k, taken without implausible measurements, and the outputs.
 
         `received`: measurements of all nodes in their order.
 
@@ -291,9 +291,9 @@ def _make_row_function(layout: RowLayout) -> Any:
 
 
 def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
-    """Return the traced step of a row, which JAX holds for networks that differ in numbers alone.
+    """Return the step of a row as JAX traces it, which it keeps for networks that differ in numbers alone.
 
-    `numbers`: shapes and types of the step's arrays.
+    `numbers`: shapes and types of the step's arrays. `layout`: all else of it, and the length of a row.
     """
     with jax.enable_x64(True):
         return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))

@@ -54,6 +54,7 @@ class RunLanes:
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
         self.wide = devices > 1 or not processor
+        # Lanes: LANES or WIDE_LANES, rounded up to a multiple of the devices.
         self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
         self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None

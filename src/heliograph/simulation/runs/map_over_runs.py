@@ -83,7 +83,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:
-    """Return numbers as an array, masked ones as NaN; raise ValueError for anything else."""
+    """Return numbers as an array, masked ones (as of numpy.ma) as NaN; raise ValueError for anything else."""
     try:
         values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths

@@ -168,7 +168,7 @@ def _receive_sum(
     """
     parts = []
     for sender, hop in hops.items():
-        if not first(hop).remembers:
+        if not first(hop).remembers:  # its state is ()
             _, z = deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())
             parts.append(z)
     if parts:
