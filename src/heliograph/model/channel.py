@@ -233,7 +233,8 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    # Numbers that a channel tells its receiver beside z stay with it, and no memory is shared by accident.
+    # A memory without a name, such as fading, that stands in both becomes one of each. Numbers that a channel tells its
+    # receiver follow its own outputs.
     return stack_channels_with_told_numbers(
         _delay_all_like_latest, separate_memories(check_maps("stack", [relayed, direct]))
     )

@@ -337,7 +337,7 @@ def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
 
 
 def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
-    """Raise ValueError unless both are linear and nothing in them is an angle."""
+    """Raise ValueError unless plant and sensor are linear, without modes, and nothing in them is an angle."""
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         modal = any(isinstance(first(model), AbstractWithMemory) for model in (plant, sensor))

@@ -169,7 +169,7 @@ def known_turn(
 
 
 def read_two_axes(axes: Names) -> list[str]:
-    """Return the names of two axes.
+    """Return the names of two axes, as a list, after a check that they are two.
 
     Raises:
         ValueError: another number of them.

@@ -109,7 +109,10 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 
 
 def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
+    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack.
+
+    Those of filters that know a sender's heartbeat differ: the longest decides.
+    """
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
         name: _replace_filters(
@@ -134,7 +137,7 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
 
 
 def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters that claim "nominal" at most."""
+    """Return the nodes with copies of their filters that claim "nominal" at most: what a filter believes, no bound."""
     return {
         name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()

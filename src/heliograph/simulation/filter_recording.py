@@ -151,7 +151,7 @@ def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyT
 
     `clock`: times of the rows.
     """
-    if smoothing is None:
+    if smoothing is None:  # the truth of a recording is not known
         return trajectories_record(network, {"truth": None, **outputs}, clock)
     return make_smoothed_record(network, smoothing, outputs, clock)
 

@@ -352,7 +352,10 @@ class Network(Module):
         return lowered
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
-        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel."""
+        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel.
+
+        Its own, or those that are common to all nodes; a node behind relays has neither.
+        """
         nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
         sources = {label: n if isinstance(n, Node) else self.common for label, n in nodes.items()}  # None behind relays
         return {label: (s.sensor, s.channel, nodes[label].filters[name]) for label, s in sources.items() if s}

@@ -286,7 +286,10 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
 
 
 def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
-    """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
+    """Return all outputs of one block of runs, (run, time, ...), in double precision, whichever simulated them.
+
+    `runs`: their numbers.
+    """
     if job.precision == "float64":
         return _simulate_trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):  # so that JAX computes in single precision

@@ -174,7 +174,7 @@ def cross_covariances(
 def fused_covariances(
     network: Network, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
-    """Return the covariances (time, n, n) of the network's informed fusions, by name, for complete data.
+    """Return the covariances (time, n, n) of the errors of the network's informed fusions, by name, for complete data.
 
     An informed fusion is one that knows how the errors of its estimates are correlated.
 

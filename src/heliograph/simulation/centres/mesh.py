@@ -381,7 +381,10 @@ class Mesh(Module):
         return () if None in weights else tuple(filter(None, weights))
 
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
-        """Return the estimates (1, node, ...) by group of nodes, from `mean` and `covariance` in the mesh's order."""
+        """Return the estimates (1, node, ...) by group of nodes, from `mean` and `covariance` in the mesh's order.
+
+        `places`: for each group the numbers of its nodes in the mesh. The axis of 1: of filters, here the fusion alone.
+        """
         return tuple(
             Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
         )

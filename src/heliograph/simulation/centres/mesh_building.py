@@ -75,6 +75,7 @@ def build_meshes(network: Network) -> dict[str, Mesh]:
     Raises:
         ValueError: too many nodes for a rule that follows the joint covariance of their errors.
     """
+    # DENSE: the most nodes whose joint covariance is propagated.
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         if fusion.rule.needs_joint and nodes > DENSE:

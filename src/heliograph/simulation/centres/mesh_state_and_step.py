@@ -128,7 +128,7 @@ def weigh_measurements(
     """
     observation = data.observation
     off = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
-    return jnp.einsum("inm,im->in", data.weighted, off)
+    return jnp.einsum("inm,im->in", data.weighted, off)  # weighted: H_j' R_j^-1
 
 
 def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEstimates:

@@ -237,7 +237,10 @@ def _fuse_at_relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
 
 
 def _weigh_children(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the best weights (n, child, n) of children with these errors, and the error of their weighted estimate."""
+    """Return the best weights (n, child, n) of the estimates of a relay's children, and the error of the weighted one.
+
+    `children`: their errors, as sources that they share and independent parts.
+    """
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
     return weights, ErrorSources(*children.weigh(weights))

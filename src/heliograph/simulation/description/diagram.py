@@ -52,7 +52,7 @@ def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
-    """Return the claim of each estimate by node and filter, with what the filter believes that is not the node's."""
+    """Return the claim of each estimate by node and filter, with the models of the filter that are not the node's."""
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
     for belief in yield_mistaken_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
@@ -110,7 +110,7 @@ def write_diagram(network: HasNodes) -> str:
 
 
 def write_short_diagram(network: HasNodes) -> str:
-    """Return the diagram cut to the lines, and their length, that any object is shown in; … stands for the rest."""
+    """Return the diagram cut to LINES lines, and to the length of line that any object has; … stands for the rest."""
     lines = _format_lines(network)
     if len(lines) > LINES:
         hidden = len(lines) - (LINES - 1)

@@ -185,7 +185,7 @@ def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
-    """Yield a line on the nodes whose messages declare their noise, which is taken for true."""
+    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
     names = []
     for name, node in network.nodes.items():
         told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []

@@ -26,7 +26,7 @@ def list_sensors(network: Network) -> list[AbstractSensor]:
 def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
-    """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
+    """Return the observability matrix d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
     return np.asarray(_differentiate_outputs(plant, tuple(sensors), state, np.arange(steps)))
 
 

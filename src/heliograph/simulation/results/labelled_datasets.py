@@ -308,7 +308,7 @@ def check_title(dataset: "xr.Dataset", title: str) -> None:
 
 
 def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
-    """Return the labels of a dimension of a dataset."""
+    """Return the labels of a dimension of a dataset, such as the names of nodes; raise ValueError where it lacks."""
     if axis not in dataset.dims:
         raise fail("dataset", f"the dimension {axis!r}, also where it has one label", f"{list(dataset.dims)}")
     return [str(name) for name in dataset[axis].values]

@@ -83,7 +83,7 @@ def write_record_html(record: DrawableRecord) -> str:
 
 
 def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str:
-    """Return a line of the filters with their colours and claims, and of the truth where it is drawn."""
+    """Return a line of HTML with the filters' names, colours and claims, and the truth where it is drawn."""
     entries = [
         (f"background:{colour}", f"{name} ({estimate.claim})")
         for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)

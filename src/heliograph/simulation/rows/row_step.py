@@ -87,7 +87,7 @@ class RowLayout(NamedTuple):
         return self.state.size + self.received + self.inputs + 1
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
-        """Return the filters' states, the measurements, the inputs and the step number of a row."""
+        """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
         known, rest = row[: self.state.size], row[self.state.size :]
         u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
         return self.state.tree(known), rest[: self.received], u, k

@@ -180,7 +180,10 @@ def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
 
 
 def _order_blocks(recorded: np.ndarray, dealt: np.ndarray) -> np.ndarray:
-    """Return what was recorded of blocks (block, BLOCK, ...) as (run, ...) in order; `dealt`: number of each block."""
+    """Return what was recorded of blocks of runs (block, BLOCK, ...) as (run, ...), in the order of the runs.
+
+    `dealt`: number of each block, as they were dealt to lanes.
+    """
     ordered = np.empty_like(recorded)
     ordered[dealt] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

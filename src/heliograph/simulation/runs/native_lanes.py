@@ -125,9 +125,9 @@ class NativeRuns:
         return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
 
     def _join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Return what is collected of all runs (run, ...), from what `advance` returned of each chunk of them.
+        """Return what is collected of all runs (run, ...), from what `_advance` returned of each chunk of them.
 
-        A result that all runs share is a view of one.
+        A result that all runs share (`shared`, else None) is a view of one.
         """
         leaves: list[Any] = []
         for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):

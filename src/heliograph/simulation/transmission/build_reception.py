@@ -106,6 +106,7 @@ def _split_seeds(observed: tuple[AnySensor, Channel], seeds: np.ndarray) -> tupl
 
     A memory that they share is in both.
     """
+    # A memory's identity: its name, or one of its own.
     by_identity = dict(zip(memories(observed), seeds, strict=True))
     of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
     return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)
