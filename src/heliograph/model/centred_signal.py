@@ -54,16 +54,17 @@ def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | Ov
     r = array("reference", library(reference).atleast_1d(reference), (channel.inputs,))
     forgets = without_memory(channel)
     assert isinstance(forgets, AbstractRandomAffine)
-    gain = forgets.moments(1).mean[:-1, :-1]
+    gain = forgets.moments(1).mean[:-1, :-1]  # E[G], without the offset's row and column
     return amplify_and_forward([known(np.eye(len(r)), -r), channel, known(np.eye(channel.outputs), gain @ r)])
 
 
 def predict_signal(
     plant: AbstractPlant, sensor: AbstractSensor, x: Float[Array, " n"], u: ArrayLike
 ) -> Float[jax.Array, " m"]:
-    """Return h(f(x, u) + E w) + E v, the prediction of a signal from the state x a step before.
+    """Return h(f(x, u) + E w) + E v, the prediction of the signal y from the state x a step before.
 
-    Both ends of a link compute it.
+    f: the plant's transition, w its noise; h: the sensor's function, v its noise. Both ends of a link compute it, so
+    that only what differs from it has to be sent.
     """
     predicted = plant.transition(jnp.asarray(x), jnp.asarray(u)) + plant.noise_mean()
     return jnp.asarray(sensor.measure(predicted) + sensor.noise.mean)
@@ -103,7 +104,7 @@ def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "h
     """Return E[y_k] over the steps of a plant that moves by its mean alone, with these inputs."""
 
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Move the mean over a step, and return it with that of the measurement there."""
+        """Move the state's mean x over step k with inputs u; return it with the mean of the measurement there."""
         k, u = row
         plant_k, sensor_k = at(plant, k), at(sensor, k)
         x = plant_k.transition(x, u) + plant_k.noise_mean()

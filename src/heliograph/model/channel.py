@@ -199,6 +199,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
+    # Numbers that the channel tells its receiver beside z are not lost with it.
     def build(links: Sequence[AbstractRandomAffine]) -> Mixture:
         """Return the channel of one step: its link with probability p, else silence."""
         nothing = silent(links[0].outputs, links[0].inputs)
@@ -232,6 +233,8 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
+    # A memory without a name, such as fading, that stands in both becomes one of each. Numbers that a channel tells its
+    # receiver follow its own outputs.
     return stack_channels_with_told_numbers(
         _delay_all_like_latest, separate_memories(check_maps("stack", [relayed, direct]))
     )
@@ -244,7 +247,7 @@ def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[Abstra
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
-    """Each channel carries its own part of y: the first its first components, and so on.
+    """Return channels side by side, each of which carries its own part of y: the first its first components, and so on.
 
     Args:
         channels: one for each part of y, in its order.
@@ -259,6 +262,7 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
 
 def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return the links as ones that are all given the whole signal, of which each takes its own part, in turn."""
+    # past: by how many steps the latest may be late; all are given as many earlier signals.
     total, past = sum(signal_size(link) for link in links), max(link.past for link in links)
     placed = []
     start = 0  # of the link's part in the signal
@@ -284,7 +288,8 @@ def superposed(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same: bo
         ValueError: links of other sizes; an erasure in a link, since a receiver of a sum does not see who is missing;
             flags or time stamps, which would be added up.
     """
-    separate = separate_memories(check_maps("links of a sum", links))
+    separate = separate_memories(check_maps("links of a sum", links))  # one object given twice is two links
+    # Numbers that a link tells the receiver, such as its gain, arrive beside the sum.
     return build_with_told_numbers(partial(_add_up_links, noise=noise, same=same), separate)
 
 
@@ -307,7 +312,10 @@ def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same:
 
 
 def _check_can_be_added(name: str, link: AbstractRandomAffine) -> None:
-    """Raise ValueError where a link delivers what cannot be added up."""
+    """Raise ValueError where a link delivers what cannot be added up: flags, time stamps, or NaN for what it lost.
+
+    `name`: what the link is called in the error.
+    """
     inside = [link, *all_inner_maps(link)]
     if any(isinstance(m, ModeOutput) or (isinstance(m, DelayedLink) and m.timestamped) for m in inside):
         raise fail(name, "one without flags and time stamps, which would be added up", type(link).__name__)
@@ -372,6 +380,7 @@ def find_received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -
             "sensor of a plant", model.measure, plant_0.initial_mean, plant_0.manifold, Manifold(senses.angles)
         )
     steps = unstack(channel) if senses.circular else [first(channel)]
+    # For each step, which of the received components are angles; gains other than 1 raise, for they bend an angle.
     results: set[Angles] = {step.carry_angles(senses.angles) for step in steps}
     if len(results) > 1:
         raise fail("channel", "the same angles at every step", sorted(results))

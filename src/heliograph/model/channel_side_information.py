@@ -108,14 +108,17 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
-    """Return a law of numbers, or None; ValueError of anything else."""
+    """Return a law of the numbers that a link tells, or None, as it is; raise ValueError for anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
 
 
 def _average_law(law: object, memory: AbstractMemory) -> ArrayLike:
-    """Return the mean of a law of numbers; zeros, the first mode, of a memory."""
+    """Return typical numbers of their law: its mean, or zeros, the first mode, where a memory's modes are told.
+
+    No law (None) raises ValueError, for then the user has to give them.
+    """
     if law is None:
         raise fail("typical numbers", "numbers as they may come, where there is no law", "none")
     if isinstance(law, AbstractLaw):
@@ -127,7 +130,10 @@ KnownGain = TypeAliasType("KnownGain", bool | Pilot)  # of a hop: told, by a pil
 
 
 def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stack:
-    """Return the hop with its gain, or a pilot's reading of it, after z; the hop itself where neither is known."""
+    """Return the hop that delivers its gain, or a pilot's reading of it, after z; the hop itself for `known` False.
+
+    `known`: True for the gain itself, or the Pilot, whose reading is the gain plus noise.
+    """
     if known is False:
         return hop
     if isinstance(known, Pilot):
@@ -194,6 +200,7 @@ def build_with_told_numbers(
     """
     links = [separate_told_numbers(channel).link for channel in channels]
     built = build(links)
+    # A channel that tells nothing is its own link.
     some_tell = any(link is not channel for link, channel in zip(links, channels, strict=True))
     return cast(M, append_told_numbers(built)) if some_tell else built
 
@@ -212,6 +219,7 @@ def stack_channels_with_told_numbers(
     """
     links = [separate_told_numbers(channel).link for channel in channels]
     placed, maps = place(links), list[AbstractRandomAffine]()
+    # A channel that tells nothing is its own link; of any other the told numbers follow its outputs.
     for link, channel, of_all in zip(links, channels, placed, strict=True):
         maps += [of_all] if link is channel else [of_all, *_list_told_outputs(of_all, of_all.inputs)]
     return Stack(maps)
@@ -225,7 +233,7 @@ def name_received_values(outputs: tuple[str, ...], channel: AbstractRandomAffine
         channel: from the sensor to the receiver; told numbers have names of their own.
         more: how many numbers are received beside what the channel delivers.
     """
-    link, values, numbers = separate_told_numbers(channel)
+    link, values, numbers = separate_told_numbers(channel)  # rows of what is received: of values, of told numbers
     count = len(values) + more
     names = list(outputs if len(outputs) == count else (f"z{i}" for i in range(count)))
     told_names = [name for affine in list_told_maps(link) for name in affine.names] if numbers else []

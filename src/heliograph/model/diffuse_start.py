@@ -38,7 +38,9 @@ class DiffuseStart(Module):
         return DiffuseStart(tuple(name_list("states with an unknown start", states)), known)
 
     def of_states(self, states: tuple[str, ...]) -> "UnknownStart":
-        """Return the start of a plant with these states.
+        """Return the start of a plant with these states: which are unknown, and the covariance of the others.
+
+        `self.names`: of the unknown ones, None for all. Rows and columns of unknown states are set to 0.
 
         Raises:
             ValueError: a name that is no state, a covariance that is none.

@@ -107,7 +107,10 @@ def check_claim(claim: object) -> None:
 
 
 def weakest(claims: list[Claim]) -> Claim:
-    """Return the strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
+    """Return the weakest of some claims, in the order "exact", "upper", "nominal", "none": what all of them support.
+
+    A claim says what an estimate's covariance is: that of its error, an upper bound of it, what the filter believes, or
+    nothing.
 
     Args:
         claims: at least one.
@@ -123,10 +126,10 @@ def weakest(claims: list[Claim]) -> Claim:
 
 
 def lower_claim_by_noise(claim: Claim, *models: PyTree) -> Claim:
-    """Lower a claim to what the noises of these models support.
+    """Return a claim, lowered to what the noises of these models support.
 
-    "upper" where one is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps of
-    which its noise is no dither.
+    "upper" where a noise is known by a bound of its covariance alone, "nominal" where a measurement is rounded to steps
+    so large that the rounding error depends on the signal.
     """
     rounded = find_rounded_noises(*models)
     if not all(noise.is_exact or noise.is_bounded for noise in rounded):
@@ -148,7 +151,7 @@ def _mask_covariances_over_time(bound: np.ndarray) -> np.ndarray:
     # In a long recording of a filter that has settled most matrices (time, n, n) are equal to the one before.
     if bound.ndim == 3 and len(bound) > 2 and np.array_equal(bound[-1], bound[len(bound) // 2]):
         rows = bound.reshape(len(bound), -1)
-        changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+        changes = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # cumsum - 1: the last change before each row
         return np.asarray(_mask_covariances(bound[changes])[np.cumsum(changes) - 1])
     return _mask_covariances(bound)
 
@@ -156,6 +159,7 @@ def _mask_covariances_over_time(bound: np.ndarray) -> np.ndarray:
 def _mask_covariances(bound: np.ndarray) -> np.ndarray:
     """Return which matrices (..., n, n) are finite and positive semidefinite to rounding."""
     finite = ~find_not_finite(bound, 2)
+    # The quick test of all at once first; else matrix by matrix, as correlations, whatever the states' units.
     if finite.all() and _are_definite((bound + np.swapaxes(bound, -1, -2)) / 2):
         return np.asarray(finite)
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
@@ -166,7 +170,10 @@ def _mask_covariances(bound: np.ndarray) -> np.ndarray:
 
 
 def _are_definite(covariances: np.ndarray) -> bool:
-    """Return whether P + tol diag(P) has a Cholesky factor for all: then correlations have no eigenvalue below -tol."""
+    """Return whether all matrices P are semidefinite to rounding: whether P + tol diag(P) has a Cholesky factor.
+
+    Then their correlations have no eigenvalue below -tol (DEFINITENESS_TOLERANCE). The matrices are changed in place.
+    """
     places = np.arange(covariances.shape[-1])
     covariances[..., places, places] *= 1 + DEFINITENESS_TOLERANCE
     try:
@@ -179,7 +186,8 @@ def _are_definite(covariances: np.ndarray) -> bool:
 def _is_semidefinite(correlations: np.ndarray) -> np.ndarray:
     """Return the mask of the matrices (..., n, n) whose eigenvalues are not below zero, to rounding.
 
-    Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol.
+    Where C + tol I has a Cholesky factor for all, which takes a sixth of the time, none has an eigenvalue below -tol
+    (DEFINITENESS_TOLERANCE); where it has none, eigenvalues tell which.
     """
     try:
         np.linalg.cholesky(correlations + DEFINITENESS_TOLERANCE * np.eye(correlations.shape[-1]))
@@ -194,7 +202,8 @@ AnyEstimate = TypeVar("AnyEstimate", bound=Estimate)
 def lower_unsound_claim(estimate: AnyEstimate) -> AnyEstimate:
     """Return one estimate, with the claim "none" where its mean is no number or its covariance is none.
 
-    Several estimates side by side are returned as they are: `claims` says of which theirs holds.
+    Several estimates side by side (a mean of more than one axis) are returned as they are: their property `claims` says
+    of which theirs holds.
     """
     if estimate.claim == "none" or np.ndim(estimate.mean) > 1 or mask_sound_estimates(estimate).all():
         return estimate

@@ -181,6 +181,7 @@ def shared(link: Channel, name: str) -> Channel:
     if not held:
         raise fail("shared link", "one with memory, such as gilbert_elliott(...)", "one drawn anew at each step, which "
                    "nodes share by Network.sharing")  # fmt: skip
+    # Copies of the memories with the name; of several with a number behind it.
     twins = {key: m.named(name if len(held) == 1 else f"{name} {i}") for i, (key, m) in enumerate(held.items())}
     return replace_memories(link, twins)
 
@@ -222,7 +223,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    # Parts of the channel with memories of their own, each over all steps.
+    # The channel as a sum of terms with memories of their own, each as the list of its maps over all steps.
     terms = zip(*(split_terms_without_common_memory(step) for step in unstack(channel)), strict=True)
     constant = not isinstance(channel, OverTime)
     return any(

@@ -48,7 +48,7 @@ class Origin:
     several: bool = False
 
     def has_form_of(self, state: PyTree) -> bool:
-        """Return whether the state has the form of another one, and arrays of its shapes."""
+        """Return whether this origin's state has the same tree structure as another state, and arrays of its shapes."""
         own, other = ((str(form), [np.shape(leaf) for leaf in leaves])
                       for leaves, form in map(jax.tree.flatten, (self.state, state)))  # fmt: skip
         return own == other
@@ -75,6 +75,7 @@ def find_median_spacing(time: np.ndarray) -> float:
     if len(time) < 2:
         return float("nan")
     steps = seconds_between(np.asarray(time))[1:]
+    # Equal steps need no sorting.
     return float(steps[0] if steps.min() == steps.max() else np.median(steps))
 
 

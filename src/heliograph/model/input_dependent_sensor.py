@@ -47,7 +47,7 @@ class NoiseOfInputs(Module):
         return value * jnp.eye(self.outputs) if value.ndim == 0 else value
 
     def _refuse(self) -> Any:
-        """Raise ValueError: here the noise must be a constant law."""
+        """Raise ValueError: what asks for the law's numbers needs a constant one, and this depends on `inputs`."""
         raise fail(
             "sensor noise", "a constant one, as what is computed before data needs", f"one of {list(self.inputs)}"
         )
@@ -76,7 +76,14 @@ def count_matrix_rows(matrix: object, inputs: tuple[str, ...]) -> int:
 def read_noise_of_inputs(
     noise: Any, outputs: Names | None, rows: int | None, inputs: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Any]:
-    """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs."""
+    """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs.
+
+    Args:
+        noise: a law, a covariance, a variance, or a function of the inputs that returns a covariance.
+        outputs: names of the outputs; y, or y0, y1, ... for None.
+        rows: of the sensor's matrix; None for a sensor without one.
+        inputs: names of the inputs on which the noise may depend.
+    """
     # How many outputs there are, said by the sensor's matrix, or by their names, or by the noise; else it is one.
     components = None if callable(noise) else count_components(noise)
     count_without_matrix = (components or 1) if outputs is None else len(name_list("sensor outputs", outputs))

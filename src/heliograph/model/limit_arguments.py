@@ -34,10 +34,10 @@ def read_intervals(limits: object, received: int, name: str = "limits") -> Float
 
 
 def read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
-    """Return real numbers as an array of doubles, or raise one line."""
+    """Return real numbers as an array of doubles; raise ValueError, which says what was `expected` of `name`."""
     try:
         values = np.asarray(value)
-        if values.size and values.dtype.kind not in "fiu":
+        if values.size and values.dtype.kind not in "fiu":  # neither floats nor whole numbers, signed or not
             raise ValueError
     except (TypeError, ValueError, OverflowError):
         raise fail(name, expected, show_value(value)) from None

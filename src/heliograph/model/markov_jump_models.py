@@ -60,11 +60,14 @@ class SwitchingRates(Module):
         self.real, self.imaginary = projectors.real, projectors.imag
 
     def transition_over(self, time: jax.Array) -> jax.Array:
-        """Return exp(G t), the transition (modes, modes) over a time t."""
+        """Return exp(G t), the transition probabilities (modes, modes) over a time t under the rates G.
+
+        By the eigenvalues growth + i turn of G, and their projectors real + i imaginary.
+        """
         size = jnp.exp(jnp.asarray(self.growth) * time)
         cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)
         rows = jnp.einsum("k,kij->ij", cosine, self.real) - jnp.einsum("k,kij->ij", sine, self.imaginary)
-        return jnp.maximum(rows, 0.0)
+        return jnp.maximum(rows, 0.0)  # rounding may leave one a little below 0
 
 
 class ModalPlant(AbstractPlant, AbstractWithMemory):
@@ -118,14 +121,14 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
         return self._refuse()
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractPlant:
-        """Return the plant of this mode; for a traced mode, one with its numbers, or a choice among the plants."""
+        """Return the plant of mode `state`; for a traced one a plant with that mode's numbers, or a choice of them."""
         if isinstance(state, int | np.integer):
             return self.models[state]
         same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
         return _ChosenPlant(self.models, jnp.asarray(state)) if same_numbers is None else same_numbers
 
     def _refuse(self) -> NoReturn:
-        """Raise ValueError: what needs one law of motion got several."""
+        """Raise ValueError: what needs one law of motion got several, and SEVERAL_TAKEN_BY says what takes them."""
         raise fail(
             "plant", f"one law of motion here ({SEVERAL_TAKEN_BY})", f"a markov_plant of {len(self.models)} modes"
         )
@@ -192,7 +195,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
             model.check_states(states)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractSensor:
-        """Return the sensor of this mode; for a traced mode, one with its numbers, or a choice among the sensors."""
+        """Return the sensor of mode `state`; of a traced one a sensor with that mode's numbers, or a choice of them."""
         if isinstance(state, int | np.integer):
             return self.models[state]
         same_numbers = select_model_of_equal_structure(self.models, jnp.asarray(state))
@@ -327,9 +330,10 @@ def markov_sensor(
 
 
 def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax.Array:
-    """Return the transition (M, M) of joint modes over a row with inputs u.
+    """Return the transition probabilities (M, M) of joint modes, of the plant and all else, over a row with inputs u.
 
-    The plant's mode is the slowest: it moves by the plant's rates over dt, if it has some, then all by the chain.
+    The plant's mode is the slowest in their order: it moves by the plant's rates over the input dt, if the plant has
+    rates (it is `chain` alone otherwise), then all move by `chain` (M, M).
     """
     if not isinstance(plant, ModalPlant) or plant.rates is None:
         return chain
@@ -343,7 +347,7 @@ def list_mode_models(model: Any) -> tuple[Any, ...]:
 
 
 def _read_mode_models(name: str, models: object, kind: type) -> tuple[Any, ...]:
-    """Return the models of a chain's modes, each of one law at each step."""
+    """Return the models of a chain's modes, at least two, checked: of the class `kind`, constant and without modes."""
     checked = tuple(items(name, models, "one model for each mode"))
     if len(checked) < 2:
         raise fail(name, "at least two, one for each mode", len(checked))

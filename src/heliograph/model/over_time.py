@@ -28,6 +28,7 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
+        # A model's values at all steps: every array inside has the same leading axis, of steps.
         self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:
@@ -51,10 +52,11 @@ def _list_arrays(tree: object) -> list[PyTree]:
 
 def stack(models: Sequence[T]) -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis."""
-    flat = [jax.tree.flatten(model) for model in models]
+    flat = [jax.tree.flatten(model) for model in models]  # of each: its leaves, and its structure
     if len({_describe_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
     pieces = zip(*(leaves for leaves, _ in flat), strict=True)
+    # What is no array is the same in all of them.
     stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
     steps_of_parts: T = jax.tree.unflatten(flat[0][1], stacked)
     return steps_of_parts
@@ -111,6 +113,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
         """Return the k-th values of an `OverTime`, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
+        # Only arrays have an axis of steps; what is none is the same at all steps.
         values, rest = eqx.partition(leaf.values, eqx.is_array)
         return eqx.combine(jax.tree.map(lambda v: _take_entry(v, k), values), rest)
 
@@ -118,7 +121,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
 
 
 def _take_entry(values: PyTree, k: PyTree) -> object:
-    """Return values[k], also for a k that is traced."""
+    """Return the entry k of an array along its first axis, also for a k that JAX traces."""
     if isinstance(k, jax.Array):
         return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
     return values[k, ...]  # the dots keep a number an array

@@ -115,10 +115,10 @@ class AbstractPlant(Module):
     def make_motion_about(
         self, u: jax.Array, center: jax.Array, middle: jax.Array | None = None
     ) -> Callable[[jax.Array], jax.Array]:
-        """Return x -> f(x, u) as moments are made of it, about `center` and the state `middle` after the step.
+        """Return x -> f(x, u) in coordinates in which means and covariances can be taken, about `center`.
 
-        Angles are continued from those at `center`; changes of attitudes from `center` become changes from `middle`,
-        f(center, u) unless given, added to it.
+        Angles do not jump by turns, but go on from those at `center`. Attitudes are given as changes from `center`, and
+        returned as changes from `middle`, the state after the step (f(center, u) unless given), added to it.
         """
         f: Callable[[jax.Array], jax.Array] = self.manifold.chart_move(lambda x: self.transition(x, u), center, middle)
         return f
@@ -134,13 +134,13 @@ class AbstractPlant(Module):
         return as_real(self.noise(u))
 
     def noise_mean(self) -> jax.Array:
-        """Return the mean of w, (n,)."""
+        """Return the mean of the process noise w, (n,); zero where only a covariance is known of it."""
         if isinstance(self.noise, AbstractNoise | JointNoise):
             return jnp.asarray(self.noise.mean)
         return jnp.zeros(self.initial_mean.shape)
 
     def sample_noise(self, key: jax.Array, u: jax.Array) -> jax.Array:
-        """Draw w."""
+        """Draw the process noise w (n,) of a step with inputs u."""
         if isinstance(self.noise, AbstractNoise):
             return self.noise.sample(key)
         if isinstance(self.noise, JointNoise):
@@ -148,7 +148,7 @@ class AbstractPlant(Module):
         return cholesky(self.noise_covariance(u)) @ jax.random.normal(key, self.initial_mean.shape, dtype=float)
 
     def sample_initial(self, key: jax.Array) -> jax.Array:
-        """Draw x_0."""
+        """Draw the initial state x_0 (n,), by the law of its deviation, or a Gaussian one where none is given."""
         mean = jnp.asarray(self.initial_mean)
         if self.deviation is not None:
             x = mean - self.deviation.mean + self.deviation.sample(key)
@@ -323,7 +323,7 @@ class LinearPlant(AbstractPlant):
         check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
-        """Return an array, or a function of the inputs, after a check of its shape."""
+        """Return a matrix of the plant as an array, or as a function of the inputs u, after a check of its shape."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)
@@ -343,7 +343,7 @@ class LinearPlant(AbstractPlant):
 
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of rotation vectors, three after three, in their order."""
+    """Return the names of the states that are rotation vectors, three for each attitude; raise unless they are so."""
     given = [str(name) for name in items("attitude", attitude, "names")]
     wrong = len(given) % 3 or len(set(given)) < len(given) or not set(given) <= set(states) - set(circular)
     if wrong:
@@ -355,7 +355,7 @@ def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: t
 def _read_initial_law(
     mean: ArrayLike, spread: NoiseLike | DiffuseStart, unknown: bool = False
 ) -> tuple[Vector, Any, AbstractNoise | None]:
-    """Return the mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
+    """Return mean, covariance and law of the deviation (None: Gaussian) of an initial state; diffuse if `unknown`."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]
     if isinstance(spread, DiffuseStart):
@@ -373,7 +373,7 @@ AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime ho
 
 
 def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
-    """Return which of so many states are angles, from their places, or also attitudes, from the plant they are of."""
+    """Return which of so many states are angles or attitudes: from the places of angles, or from the states' plant."""
     plant = first(angles)
     if not isinstance(plant, AbstractPlant):
         return Manifold(angles_at(angles, states))
@@ -383,7 +383,7 @@ def read_manifold(angles: "Sequence[int] | AnyPlant", states: int) -> Manifold:
 
 
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:
-    """Raise ValueError unless a user's function returns an array of `shape`."""
+    """Raise ValueError unless a user's function, `called` with `values`, returns an array of `shape`; it is traced."""
     try:
         got = trace_shape(name, called, *values)
     except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:

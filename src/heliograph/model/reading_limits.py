@@ -93,6 +93,8 @@ class ReadingLimits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
+        # Low and high limits of each of `received` numbers; values that are codes, no readings; and from how many equal
+        # readings in a row a component is stuck (None: runs are not counted).
         pairs = read_intervals(limits, received)
         self.low, self.high = pairs[:, 0], pairs[:, 1]
         codes = read_numbers("invalid values", invalid)
@@ -109,7 +111,8 @@ class ReadingLimits(Module):
     def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
         """Return readings without those that count as missing, given the runs of equal ones before them, if any.
 
-        What is beyond limits or a code is no reading, and ends no run.
+        Missing is what is beyond the limits, or a code; neither ends a run. `self.stuck`: from how many equal readings
+        in a row a component is missing too; None where runs are not counted.
         """
         refused = self.find_refusal_reasons(z)
         values = np.where(refused > 0, np.nan, z)
@@ -123,8 +126,8 @@ class ReadingLimits(Module):
     def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
         """Return the number of the reason for which each value by itself counts as missing; 0 where it does not.
 
-        A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits. NaN
-        is missing already.
+        A code is a value of `invalid` that stands for no reading, such as -999, also where it is beyond the limits
+        (`low`, `high`). NaN is missing already.
         """
         beyond = (z < self.low) | (z > self.high)
         return np.where(
@@ -161,7 +164,8 @@ def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.nda
     numbers = np.asarray(z, dtype=np.float64)[..., None]
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
-    # Whole numbers are exact in both precisions, but for the largest.
+    # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. Whole numbers
+    # are exact in both precisions, but for the largest.
     with np.errstate(over="ignore"):
         single = codes.astype(np.float32).astype(np.float64)
     rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)

@@ -72,7 +72,10 @@ class RelayNetwork(Module):
 
     @property
     def received(self) -> tuple[int, ...]:
-        """Length of what each filter receives, in the order of `filters`."""
+        """Return how many numbers each filter receives in a step, in the order of `filters`: relays and receiver.
+
+        By the first link to it in any slot; all deliver as many.
+        """
         return tuple(
             next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
             for name in self.filters
@@ -168,7 +171,11 @@ class RelaySteps(Module):
         return np.repeat(np.arange(len(self.received)), self.received)
 
     def predict_maps(self) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
-        """Return B and b of the prediction B s + b of each received number from the estimate s of its filter."""
+        """Return B and b of the prediction B s + b of each received number from the estimate s of its filter.
+
+        R numbers in all. What is sent, (y, each relay's signal), is predicted from s: y by a step of the plant, a
+        relay's signal, which is of a step before, by the sensor alone; `gain` and `offset` are the links' means.
+        """
         relays = len(self.received) - 1
         predicted = [self.sensing @ self.transition, *[self.sensing] * relays]
         constant = np.einsum("kmn,kn->km", self.sensing, self.drift) + self.sensor_offset
@@ -225,7 +232,10 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
 
 
 def _list_arrays_by_step(model: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
-    """Return one array of a plant or sensor for each step."""
+    """Return an array of a plant or sensor at each of `horizon` steps, with a leading axis of steps.
+
+    `read`: takes the array out of the model. `dimensions`: its axes at one step; one more if the model varies.
+    """
     value = np.asarray(read(stack_over_time(model)), dtype=np.float64)
     if value.ndim == dimensions + 1:
         return value[:horizon]
@@ -267,8 +277,11 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
 
 
 def _check_reached(network: RelayNetwork, name: str) -> None:
-    """Raise if nobody ever transmits to a relay, or to the receiver."""
-    received = {sender for slot in network.slots for sender in slot.get(name, {})}
+    """Raise ValueError if nobody ever transmits to a relay, or to the receiver (RECEIVER), called `name`.
+
+    A slot maps each receiver to its senders with their links.
+    """
+    received = {sender for slot in network.slots for sender in slot.get(name, {})}  # in any slot of the schedule
     if name == RECEIVER and not received:
         raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")
     if not received - {name}:

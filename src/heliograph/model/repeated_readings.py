@@ -48,7 +48,9 @@ class Repeats(NamedTuple):
 
     @staticmethod
     def read(stored: object) -> "Repeats":
-        """Return runs that were stored: a list of their parts, until version 0.4.0 of two; or the runs themselves.
+        """Return runs of equal readings that were stored: as a list of the fields, or as they are.
+
+        Until version 0.4.0 two fields were stored; the others are empty then.
 
         Raises:
             ValueError: no such list.
@@ -115,12 +117,16 @@ def bound_probability_of_equal_readings(
 def _bound_probability_within_step(
     noise: AbstractNoise, step: Float[np.ndarray, " outputs"]
 ) -> Float[np.ndarray, " outputs"]:
-    """Return the largest probability that one noise lies in an interval of a step, of each output."""
+    """Return the largest probability that the noise of each output lies in an interval as long as its `step`.
+
+    It is that of the interval about the mean. `step`: the least difference of two readings, such as a converter's.
+    """
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
         return np.asarray(1 - 2 * scipy.special.stdtr(float(noise.degrees), -step / (2 * scale)))
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
+    # A mixture of Gaussians: the logarithms of their shares, and their variances.
     log_share, _, variance = (np.asarray(part) for part in noise.branches())
     with np.errstate(divide="ignore"):
         return np.asarray(np.sum(np.exp(log_share) * scipy.special.erf(step[:, None] / np.sqrt(8 * variance)), axis=1))
@@ -137,7 +143,7 @@ def longest_run_by_chance(equal: Float[np.ndarray, "..."], seldom: float = SELDO
     """
     with np.errstate(divide="ignore"):
         n = 1 + np.ceil(np.log(seldom) / np.log(np.clip(equal, 0.0, 1 - 1e-12)))
-    return np.asarray(np.maximum(n, LEAST))
+    return np.asarray(np.maximum(n, LEAST))  # LEAST, 3: two equal ones may be one that was sent twice
 
 
 def find_stuck_counts(

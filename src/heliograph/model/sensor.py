@@ -75,14 +75,17 @@ class AbstractSensor(Module):
         return self
 
     def under(self, names: Sequence[str], u: Array) -> "AbstractSensor":
-        """Return the sensor as it is under the inputs u of a plant, whose names these are."""
+        """Return the sensor as it is under the inputs u of a plant, called `names`, of which it may take some."""
         if not self.inputs:
             return self
         places = np.array([list(names).index(name) for name in self.inputs])
         return _sensor_under_inputs(self, u[places])
 
     def typical(self, names: Sequence[str]) -> "AbstractSensor":
-        """Return the sensor under inputs of 1; raise ValueError unless the plant has the inputs that it needs."""
+        """Return the sensor under inputs of 1, which stand for any; raise ValueError where the plant lacks its inputs.
+
+        `names`: of the plant's inputs.
+        """
         lacking = [name for name in self.inputs if name not in names]
         if lacking:
             expected = f"some of the plant's, {list(names)} (it may have ones that move nothing)"
@@ -95,8 +98,8 @@ class AbstractSensor(Module):
             raise fail(f"sensor of {name}", "one that depends on no inputs", f"one of {list(self.inputs)}")
 
     def check_states(self, states: int) -> None:
-        """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
-        if self.inputs:
+        """Raise ValueError unless the sensor measures a state of this length and returns as many numbers as outputs."""
+        if self.inputs:  # inputs of 1 stand for any
             _sensor_under_inputs(self, np.ones(len(self.inputs))).check_states(states)
             return
         try:
@@ -235,7 +238,10 @@ class LinearSensor(AbstractSensor):
         )
 
     def check_states(self, states: int) -> None:
-        """Raise ValueError unless the matrix is for states of this length: to trace the function would take long."""
+        """Raise ValueError unless the sensor's matrix has as many columns as the state is long.
+
+        Its shape says so at once; only a matrix that depends on inputs is traced.
+        """
         if self.inputs:
             super().check_states(states)
         elif self.matrix.shape[-1] != states:
@@ -273,7 +279,7 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
     """
 
     def shape(states: int) -> tuple[int, ...] | None:
-        """Return the shape of h for a state of this length, None where h does not take it."""
+        """Return the shape of h(x), h being `measure`, for a state of this length; None where h does not take it."""
         try:
             with jax.enable_x64(True):
                 return tuple(jax.eval_shape(lambda x: jnp.asarray(measure(x)), np.zeros(states)).shape)
@@ -302,11 +308,11 @@ def _is_sensor(model: object) -> bool:
 
 
 def _drop_names(model: Any) -> Any:
-    """Return the sensor with outputs called y0, y1, ..., and so all of which it is made."""
+    """Return the sensor with outputs called y0, y1, ..., and so the sensors inside it; what is no sensor as it is."""
     if not _is_sensor(model) or "outputs" not in vars(model):
         return model
     parts, tree = jax.tree.flatten(model, is_leaf=lambda part: part is not model and _is_sensor(part))
-    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])
+    bare = jax.tree.unflatten(tree, [_drop_names(part) for part in parts])  # a copy, so that it may be changed
     object.__setattr__(bare, "outputs", names("sensor outputs", None, len(model.outputs), "y"))
     object.__setattr__(bare, "circular", tuple(f"y{i}" for i in model.angles))
     return bare
@@ -331,7 +337,7 @@ def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
 
 
 def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
-    """Raise ValueError unless both are linear and nothing in them is an angle."""
+    """Raise ValueError unless plant and sensor are linear, without modes, and nothing in them is an angle."""
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         modal = any(isinstance(first(model), AbstractWithMemory) for model in (plant, sensor))

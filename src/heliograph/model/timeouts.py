@@ -25,7 +25,10 @@ class LongSilences(NamedTuple):
     unit: str
 
     def describe(self) -> str:
-        """Say how many there are, and where the longest one is."""
+        """Return how many silences of a node there are, how long the longest is, and after which row, in words.
+
+        `rows`: the row before each, `lengths`: how long each is, in the unit of `timeout`.
+        """
         longest = int(np.argmax(self.lengths))
         several = f"{len(self.rows)} times, the longest " if len(self.rows) > 1 else ""
         where = f"{several}after row {self.rows[longest] + 1}"

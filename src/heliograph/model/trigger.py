@@ -74,7 +74,7 @@ class AbstractTrigger(Module):
         return self.reference in ("sent", "acknowledged")
 
     def side_information(self, outputs: int) -> int:
-        """Count the numbers about losses that arrive behind z."""
+        """Count the numbers about lost transmissions that arrive behind z: none, one, or one for each component."""
         if self.losses == "unknown":
             return 0
         return outputs if self.region == "each" else 1
@@ -89,11 +89,16 @@ class AbstractTrigger(Module):
     def start(self, outputs: int) -> SenderState:
         """Return a sender that has transmitted nothing yet."""
         nothing = jnp.zeros(outputs, dtype=int)
+        # Where y is compared with a value sent before, the first value begins.
         begun = jnp.full(outputs, not self.needs_reference)
         return SenderState(jnp.zeros(outputs), nothing, begun, nothing, nothing)
 
     def reasons(self, sender: SenderState, y: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return the reason for which each component is sent, (m,); 0 where it is not."""
+        """Return the reason for which each component of y is sent at step k, (m,), 0 (SILENT) where it is not.
+
+        FIRST where there is no reference yet, else EVENT by the rule, else HEARTBEAT where the last one is too old
+        (`age`: steps since it).
+        """
         reason = jnp.where(self.event(y - sender.reference, key, k), self._event_reason(), SendReason.SILENT)
         if self.heartbeat is not None:
             due = sender.age + 1 >= self.heartbeat
@@ -105,7 +110,11 @@ class AbstractTrigger(Module):
         return SendReason.EVENT
 
     def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
-        """Return the sender after it transmitted what has a reason, of which `arrived` arrived."""
+        """Return the sender after it transmitted the components that have a reason, of which `arrived` arrived (m,).
+
+        `lost` counts the transmissions lost since the last that arrived; the reference is the value sent last, or the
+        last that was acknowledged; a reason is stored with a minus sign if the transmission was lost.
+        """
         sent = reason > 0
         arrived = arrived & sent
         renewed = arrived if self.reference == "acknowledged" else sent
@@ -126,6 +135,7 @@ class AbstractTrigger(Module):
             key: random, for rules that draw.
             k: the step.
         """
+        # A reason above 0: the component is sent. What the channel would not lose is present.
         reason, is_present = self.reasons(sender, y, key, k), ~jnp.isnan(z)
         # Components are sent one by one, or all in one message.
         one_by_one = self.region == "each"
@@ -135,7 +145,11 @@ class AbstractTrigger(Module):
         return self.after(sender, y, reason, arrived), received
 
     def known_losses(self, sender: SenderState, reason: jax.Array, arrived: jax.Array) -> jax.Array:
-        """Return the numbers about losses that arrive behind z, from the sender before this step."""
+        """Return the numbers about losses that arrive behind z, from the sender before this step.
+
+        "numbered": how many transmissions were lost since the last that arrived, NaN where none arrives now; "known":
+        whether one was lost now; "unknown": none. (m,) if components are sent one by one, else one.
+        """
         sent = reason > 0
         if self.losses == "numbered":
             flags = jnp.where(arrived & sent, sender.lost.astype(float), jnp.nan)
@@ -150,7 +164,10 @@ class AbstractThreshold(AbstractTrigger):
     delta: eqx.AbstractVar[Float[Array, "..."]]
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-        """Return |y - reference| > delta, of a component, of any of them, or of all as a vector."""
+        """Return whether each component is sent, (m,): where error = y - reference is beyond delta.
+
+        Each by its own error ("each"), all where that of any is ("box"), or by the length of the vector ("ball").
+        """
         delta = jnp.asarray(self.delta)
         if self.region == "ball":
             return jnp.full(len(error), jnp.sum(error**2) > delta**2)
@@ -158,7 +175,10 @@ class AbstractThreshold(AbstractTrigger):
         return beyond if self.region == "each" else jnp.full(len(error), jnp.any(beyond))
 
     def check_outputs(self, outputs: int) -> None:
-        """Raise ValueError unless delta is one number, or one for each component of a box."""
+        """Raise ValueError unless delta, the threshold, is one number, or one for each component of a box.
+
+        A ball's radius is one number.
+        """
         if np.ndim(self.delta) and (self.region == "ball" or np.shape(self.delta) != (outputs,)):
             expected = "one number" if self.region == "ball" else f"one number, or {outputs}"
             raise fail("delta of the trigger", expected, f"shape {np.shape(self.delta)}")
@@ -193,6 +213,7 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
+        # The threshold, the rule in words, and after how many silent steps it sends (None: never).
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
@@ -221,6 +242,8 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
+        # The threshold, the rule in words, and after how many silent steps it sends (None: never). Both ends
+        # of the link compute the prediction that y is compared with.
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
@@ -252,6 +275,7 @@ class StochasticTrigger(AbstractTrigger):
         reference: Literal["zero", "prediction"] = "zero",
         losses: Literal["unknown", "known"] = "unknown",
     ):
+        # The weight of the squared error, by which it is drawn whether to send: a positive number or matrix.
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
@@ -274,7 +298,7 @@ class StochasticTrigger(AbstractTrigger):
         return (~arrived).astype(float)[: self.side_information(len(arrived))]
 
     def check_outputs(self, outputs: int) -> None:
-        """Raise ValueError unless the weight is one number or a matrix of so many components."""
+        """Raise ValueError unless the weight of the squared error is one number or a matrix of so many components."""
         if np.ndim(self.weight) and len(self.weight) != outputs:
             raise fail(
                 "weight of the trigger", f"a number, or shape {(outputs, outputs)}", f"shape {self.weight.shape}"
@@ -296,6 +320,7 @@ class Periodic(AbstractTrigger):
     heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
+        # All of y is sent at steps `phase`, `phase` + `period`, ..., whatever its value: the reference plays no part.
         if check_count("phase", phase, 0) >= check_count("period", period):
             raise fail("phase", f"a whole number below the period {period}", phase)
         self.period, self.phase = np.asarray(period), np.asarray(phase)
@@ -311,7 +336,7 @@ class Periodic(AbstractTrigger):
 
 
 def read_threshold(delta: ArrayLike) -> Float[Array, "..."]:
-    """Return a delta, which is positive, or one for each component."""
+    """Return a threshold delta as an array, after a check: a positive number, or one for each component."""
     report_domain("delta", delta, POSITIVE)
     checked: Array = scalar("delta", delta) if rank("delta", delta) == 0 else array("delta", delta, (None,))
     if not is_traced(checked) and not np.all(checked > 0):
@@ -320,7 +345,7 @@ def read_threshold(delta: ArrayLike) -> Float[Array, "..."]:
 
 
 def read_choice(name: str, value: object, kinds: object) -> Any:
-    """Return a value that is one of the words of a type; refuse any other.
+    """Return a value that is one of the words of a type, such as Literal["sent", "acknowledged"]; refuse any other.
 
     Raises:
         ValueError: none of them.

@@ -90,7 +90,7 @@ def _compare_turned(name: str, function: Callable[..., jax.Array], places: Seque
 
 
 def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
-    """Return the state with another rotation vector of the same attitude: the turn back, the long way round.
+    """Return the state with the other rotation vector of the same attitude: the turn the other way, r (1 - 2 pi / |r|).
 
     Args:
         x: the state.
@@ -105,7 +105,7 @@ def _turn_attitude_long_way_round(x: np.ndarray, places: Sequence[int]) -> np.nd
 def _evaluate_at_points(
     function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]
 ) -> jax.Array:
-    """Return f(x) at each of some points x, with further arguments (points, ...)."""
+    """Return f(x, ...) at each of some points x, with the i-th entry of each of `rests` as its further arguments."""
     return jnp.stack([jnp.asarray(function(x, *(values[i] for values in rests))) for i, x in enumerate(points)])
 
 

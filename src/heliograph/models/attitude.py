@@ -30,7 +30,7 @@ def turn_attitude(attitude: Float[ArrayLike, "*any 3"], by: Float[ArrayLike, "*a
 
 
 def rotation_matrix(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 3 3"]:
-    """Return R = exp [r]x of an attitude: R v is a vector v of the body as the world sees it, R' that of the world.
+    """Return R = exp [r]x of an attitude r: R turns a vector from the body's axes into the world's, R' turns it back.
 
     Args:
         attitude: rotation vector in radians. Shape (..., 3).
@@ -73,12 +73,15 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
 
 
 def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
-    """Return an array of JAX as it is, any other as doubles, NaN for what is missing; check its last axis."""
+    """Return an array of JAX as it is, any other as doubles; raise ValueError unless its last axis has length `last`.
+
+    NaN stands for a missing coordinate and is let through. `name`: what the array is called in errors.
+    """
     if isinstance(value, jax.Array):
         read = value
     else:
         try:
-            read = array(name, value, (None,) * np.ndim(value), missing=True)
+            read = array(name, value, (None,) * np.ndim(value), missing=True)  # None: an axis of any length
         except (TypeError, ValueError):
             read = array(name, value, (last,), missing=True)  # no array of numbers, which this names
     if jnp.shape(read)[-1:] != (last,):

@@ -106,7 +106,10 @@ class ContinuousSystem(Module):
         """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Return the terms of order k of both series, and the sums with them."""
+            """Return the terms of order k of both series, and the sums with them; a is A, h the length of the step.
+
+            The terms are h^k A^(k-1) / k! of the integral of exp(A s), and the like of exp(A s) S exp(A s)'.
+            """
             power, spread, integral, noise = parts
             power, moved = a @ power * (h / k), a @ spread * (h / k)
             spread = moved + moved.T
@@ -123,7 +126,10 @@ class ContinuousSystem(Module):
 
 
 def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
-    """Return F - I, F, the integral of F, and Q over twice the step, given those over the step."""
+    """Return F - I, F, the integral of F, and Q over twice the step, given those over the step in the same order.
+
+    F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, and Q(2h) = Q + F Q F', written with `growth`, F - I.
+    """
     moved = noise + growth @ noise
     return (
         2 * growth + growth @ growth,
@@ -134,10 +140,13 @@ def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[A
 
 
 def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
-    """Return the turn of a loop that doubles `count` times and then leaves all as it is."""
+    """Return the body of a loop that doubles a step in its first `count` turns, and then leaves its parts as they are.
+
+    A compiled loop has a fixed number of turns, while `count` may be traced.
+    """
 
     def double_if_left(i: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Double the parts if i is below the count."""
+        """Return the matrices of twice the step in turn i of the loop, if i is below `count`, else those given."""
         # What is not doubled any more is taken as zero, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
         doubled = _double_step(*(jnp.where(goes_on, part, 0.0) for part in parts))
@@ -147,7 +156,7 @@ def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[
 
 
 def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
-    """Return A, B and the noise intensity as arrays of shapes that fit."""
+    """Return A (n, n), B (n, inputs; no columns for None) and the noise intensity (n, n), checked, as one system."""
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
     a = array("matrix of the motion", a, (n, n))
@@ -246,7 +255,7 @@ def continuous_plant(
 
 
 def append_time_step(inputs: Names) -> list[str]:
-    """Return the names of inputs with "dt" behind them."""
+    """Return the names of inputs with "dt" (TIME_STEP) behind them, the length of a step; raise if it is among them."""
     listed = name_list("input names", inputs)
     if TIME_STEP in listed:
         raise fail("input names", f"no {TIME_STEP!r}, which is added as the length of a step", listed)

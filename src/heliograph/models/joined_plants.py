@@ -36,8 +36,8 @@ class TransitionSideBySide(Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state after a step."""
-        parts, start = [], 0
+        """Return the joint state after a step: each plant moves its own part of x by its own inputs of u."""
+        parts, start = [], 0  # start: where the plant's part of x begins
         for plant, own in zip(self.plants, split_inputs(u, self.places), strict=True):
             parts.append(plant.transition(x[start : start + len(plant.states)], own))
             start += len(plant.states)
@@ -48,7 +48,7 @@ class MatrixSideBySide(TransitionSideBySide):
     """The block-diagonal matrix of linear plants."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
-        """Return A (n, n)."""
+        """Return A (n, n) of the joint state under the inputs u of all plants: the plants' own along the diagonal."""
         plants: list[Any] = list(self.plants)  # linear ones
         pairs = zip(plants, split_inputs(u, self.places), strict=True)
         return jnp.asarray(block_diagonal([jnp.asarray(plant.transition_matrix(own)) for plant, own in pairs]))
@@ -58,7 +58,7 @@ class InputsSideBySide(TransitionSideBySide):
     """The input matrices of linear plants, one above the other."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
-        """Return B (n, inputs)."""
+        """Return B (n, inputs) under the inputs u: each plant's rows, zero but in the columns of its own inputs."""
         rows, plants = [], list[Any](self.plants)  # linear ones
         for plant, own, at in zip(plants, split_inputs(u, self.places), self.places, strict=True):
             matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own))
@@ -131,10 +131,16 @@ def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
 
 
 def _join_matrices(parts: list[Any], places: tuple[tuple[int, ...], ...], count: int) -> tuple[Any, Any]:
-    """Return A and B of linear plants side by side: constants, or functions of the inputs where some part is one."""
+    """Return A and B of linear plants side by side: constants, or functions of the inputs where one of theirs is.
+
+    Args:
+        parts: the plants, each with its own states and inputs.
+        places: of each plant's inputs among all inputs.
+        count: number of all inputs.
+    """
     if any(isinstance(value, MatrixOfInputs) for plant in parts for value in (plant.matrix, plant.input_matrix)):
         plants = tuple(parts)
         return MatrixSideBySide(plants, places), InputsSideBySide(plants, places)
-    pick = np.eye(count)
+    pick = np.eye(count)  # its rows at a plant's places move the columns of B to those places
     rows = [plant.input_matrix @ pick[list(at)] for plant, at in zip(parts, places, strict=True)]
     return block_diagonal([plant.matrix for plant in parts]), library(*rows).concatenate(rows)

@@ -65,8 +65,8 @@ class LocalPlane(Module):
         Raises:
             ValueError: shapes that do not fit, or a latitude beyond 90 degrees (longitude and latitude exchanged?).
         """
-        phi, turn, rise = self._subtract_origin(latitude, longitude, height)
-        radius, _ = self._origin
+        phi, turn, rise = self._subtract_origin(latitude, longitude, height)  # latitude, longitude, height of that
+        radius, _ = self._origin  # r_0: its distance from the earth's axis
         across, along = _subtract_on_meridian(np.radians(self.latitude), self.height, phi, rise)
         # The meridian's plane turned by the difference in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2).
         out = across - 2 * (radius + across) * np.sin(turn / 2) ** 2
@@ -86,7 +86,7 @@ class LocalPlane(Module):
         """
         points = _read_coordinates("position on a local plane", position, 3)
         east, out, along = self._to_meridian(points)
-        radius, _ = self._origin
+        radius, _ = self._origin  # r_0: the origin's distance from the earth's axis
         # r - r_0 = (east^2 + 2 r_0 out + out^2) / (r + r_0), without the difference of what is large.
         distance = np.hypot(east, radius + out)
         across = (east**2 + 2 * radius * out + out**2) / (distance + radius)
@@ -96,7 +96,7 @@ class LocalPlane(Module):
         return np.stack([self.latitude + np.degrees(phi), longitude, self.height + rise], axis=-1)
 
     def to_earth(self, position: ArrayLike) -> Float[np.ndarray, "*points 3"]:
-        """Return x, y and z in metres, earth-centred and earth-fixed, of points of the plane, rounded to 1e-9 m.
+        """Return x, y and z in metres, earth-centred and earth-fixed, of points of the plane; rounding is about 1e-9 m.
 
         Args:
             position: east, north and up in metres. Shape (*points, 3).
@@ -105,7 +105,7 @@ class LocalPlane(Module):
             ValueError: an array of another shape.
         """
         east, out, along = self._to_meridian(_read_coordinates("position on a local plane", position, 3))
-        radius, above = self._origin
+        radius, above = self._origin  # distance from the earth's axis, height over the equator's plane
         c, s = np.cos(np.radians(self.longitude)), np.sin(np.radians(self.longitude))
         return np.stack([c * (radius + out) - s * east, s * (radius + out) + c * east, above + along], axis=-1)
 
@@ -119,7 +119,7 @@ class LocalPlane(Module):
             ValueError: an array of another shape.
         """
         points = _read_coordinates("earth-centred position", position, 3)
-        radius, above = self._origin
+        radius, above = self._origin  # distance from the earth's axis, height over the equator's plane
         c, s = np.cos(np.radians(self.longitude)), np.sin(np.radians(self.longitude))
         x, y, z = np.moveaxis(points, -1, 0)
         return self._from_meridian(c * y - s * x, c * x + s * y - radius, z - above)
@@ -151,7 +151,7 @@ class LocalPlane(Module):
     def _subtract_origin(
         self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what points differ by from the origin: radians, radians from -pi to pi, metres."""
+        """Return latitude, longitude (radians, the second from -pi to pi) and height of points, less the origin's."""
         named = {"latitude": latitude, "longitude": longitude, "height": height}
         values = [_read_coordinates(f"{name} of points", value) for name, value in named.items()]
         try:
@@ -170,16 +170,20 @@ class LocalPlane(Module):
         return np.stack([east, c * along - s * out, c * out + s * along], axis=-1)
 
     def _to_meridian(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is east, out of the earth's axis and along it, of east, north, up."""
+        """Return points of the plane (..., 3) in other axes: east, out of the earth's axis, and along that axis.
+
+        North and up are turned by the origin's latitude; all in metres from the origin.
+        """
         c, s = np.cos(np.radians(self.latitude)), np.sin(np.radians(self.latitude))
         east, north, up = np.moveaxis(points, -1, 0)
         return east, c * up - s * north, s * up + c * north
 
     def _find_latitude_and_height(self, across: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return differences in latitude (radians) and height of a point that lies so far from the origin.
+        """Return latitude (radians) and height of points less the origin's.
 
-        The Jacobian of (r, z) by (lat, h) is a rotation with (M + h) beside it, so a Newton step is one turn of what
-        is left.
+        The points lie `across` metres farther from the earth's axis than the origin, and `along` metres along it. The
+        Jacobian of (r, z) by (lat, h) is a rotation times diag(M + h, 1), M the meridian's radius of curvature, so
+        that a Newton step turns what is left by the latitude and divides its first part by M + h.
         """
         origin = np.radians(self.latitude)
         radius, above = self._origin
@@ -196,7 +200,7 @@ class LocalPlane(Module):
 
 
 def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
-    """Return numbers of any shape with these last axes; NaN is missing."""
+    """Return an array whose last axes have the lengths `last`, with any axes before them; NaN is missing."""
     try:
         free = max(np.ndim(value) - len(last), 0)
     except ValueError:  # rows of different lengths, which the check names
@@ -205,7 +209,10 @@ def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
 
 
 def _locate_on_meridian(latitude: Numbers, height: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance from the axis r = (N + h) cos lat, and z = (N (1 - e^2) + h) sin lat."""
+    """Return the distance r = (N + h) cos lat from the earth's axis, and the height z over the equator's plane (m).
+
+    z = (N (1 - e^2) + h) sin lat. Latitude in radians; N is the radius of curvature across the meridian.
+    """
     normal = SEMI_MAJOR / np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     above = normal * (1 - SQUARED_ECCENTRICITY) + height
     return np.asarray((normal + height) * np.cos(latitude)), np.asarray(above * np.sin(latitude))
@@ -233,7 +240,10 @@ def _subtract_on_meridian(
 
 
 def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return a latitude in radians by Bowring's formula, with the parametric latitude of a point at that direction."""
+    """Return a first latitude (radians) by Bowring's formula, from r and z: metres from the axis, and over the equator.
+
+    beta: the parametric latitude, estimated from the point's direction.
+    """
     ratio = 1 - FLATTENING  # b / a
     size = np.hypot(r, z)
     second = SQUARED_ECCENTRICITY / (1 - SQUARED_ECCENTRICITY)  # e'^2
@@ -243,7 +253,11 @@ def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _make_axes(latitude: Numbers, turn: Numbers) -> np.ndarray:
-    """Return east, north, up at points as rows, in coordinates out, east and along (the earth's axis) at the origin."""
+    """Return the axes east, north, up at points as the rows of matrices (..., 3, 3).
+
+    Their coordinates are out of the earth's axis in the origin's meridian, east of it, and along the axis. Latitude of
+    the points, and `turn`, their longitude less the origin's, in radians.
+    """
     c, s, cl, sl = np.cos(latitude), np.sin(latitude), np.cos(turn), np.sin(turn)
     c, s, cl, sl = np.broadcast_arrays(c, s, cl, sl)
     rows = [[-sl, cl, np.zeros_like(c)], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]

@@ -125,7 +125,7 @@ def gauss_markov(
 
     Source: Gelb, Applied optimal estimation (1974), 3.8.
     """
-    size, rate = _read_deviation_and_rate(deviation, time)
+    size, rate = _read_deviation_and_rate(deviation, time)  # rate: 1 / T
     named = name_list("states", states)
     eye = np.eye(len(named))
     return continuous_plant(
@@ -169,7 +169,7 @@ def known_turn(
 
 
 def read_two_axes(axes: Names) -> list[str]:
-    """Return the names of two axes.
+    """Return the names of two axes, as a list, after a check that they are two.
 
     Raises:
         ValueError: another number of them.
@@ -192,7 +192,10 @@ def _make_intensity(order: int, value: ArrayLike) -> Any:
 
 
 def _name_states(axes: Sequence[str], order: int) -> list[str]:
-    """Return the names of positions, velocities and accelerations, axis by axis."""
+    """Return the names of the states, axis by axis: position, velocity and acceleration, the first `order` of these.
+
+    "x", "x_velocity", ...; of the axis "position" the derivatives are called "velocity" and "acceleration" alone.
+    """
     named = []
     for axis in axes:
         prefix = "" if axis == "position" else f"{axis}_"

@@ -74,11 +74,11 @@ class Components:
         inside = float(scalar("coverage", coverage, 0.0, 1.0))
         if not 0 < inside < 1:
             raise fail("coverage", "a probability between 0 and 1", coverage)
-        half = ndtri((1 + inside) / 2) * self.deviation
+        half = ndtri((1 + inside) / 2) * self.deviation  # ndtri: quantile of the standard normal law
         return self.mean - half, self.mean + half
 
     def of(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and deviation (steps,) of one combination.
+        """Return mean and standard deviation (steps,) of one combination of states, by its name.
 
         Raises:
             ValueError: no combination of this name.
@@ -143,7 +143,10 @@ def components(source: HasMeans | HasMean, weights: Weights) -> Components:
 
 
 def _read_weights(name: str, value: ArrayLike, mean: np.ndarray) -> np.ndarray:
-    """Return weights of each row, like the means."""
+    """Return the weights of a combination of states for each row, in the shape of `mean` (..., n).
+
+    Given once (n,) they hold for all rows. `name`: of the combination, for errors.
+    """
     given = np.asarray(value)
     shape = mean.shape if given.ndim > 1 else mean.shape[-1:]
     weights: np.ndarray = np.broadcast_to(array(f"weights of {name!r}", value, shape), mean.shape)

@@ -38,7 +38,7 @@ class RungeKuttaStep(DriftAndStepLength):
         h = dt / self.substeps
 
         def take_substep(_: object, x: jax.Array) -> jax.Array:
-            """Return the state after one of the shorter steps."""
+            """Return the state x after one shorter step of length h: Runge and Kutta's fourth order, inputs held."""
             first = as_real(self.drift(x, inputs))
             second = as_real(self.drift(x + h / 2 * first, inputs))
             third = as_real(self.drift(x + h / 2 * second, inputs))
@@ -59,7 +59,10 @@ class LinearizedNoise(DriftAndStepLength):
     state: Array
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return Q (n, n)."""
+        """Return the noise covariance Q (n, n) of a step, by the drift's Jacobian at the fixed state `self.state`.
+
+        The inputs u are those of the drift and, where no number is given, the step's length.
+        """
         own, dt = self.split(u)
         jacobian = jax.jacfwd(lambda x: as_real(self.drift(x, own)))(jnp.asarray(self.state))
         linearized = ContinuousSystem(jacobian, np.zeros((len(self.state), 0)), self.intensity)

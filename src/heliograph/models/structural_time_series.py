@@ -36,7 +36,10 @@ class SumOfComponents(Module):
         return jnp.asarray(self.rows(jnp.asarray(u))[None])
 
     def rows(self, u: Any) -> Any:
-        """Return the weights under inputs (..., inputs): (..., n)."""
+        """Return the weights of the states (..., n) under inputs u (..., inputs).
+
+        A state whose place is not None is weighed also by the input at that place, as a regression's coefficient is.
+        """
         xp = library(u) if not isinstance(u, jax.Array) else jnp
         one = xp.ones(u.shape[:-1])
         return xp.stack([one if at is None else u[..., at] for at in self.places], axis=-1) * self.weights
@@ -82,6 +85,7 @@ class Structural(Module):
             )
         u = None if inputs is None else array("inputs", inputs, ("steps", len(names)))
         found: dict[str, Any] = {}
+        # Each component has states of its own; all others get the weight 0.
         for part, at in zip(self.parts, _find_state_places(self.parts), strict=True):
             every = np.zeros((*(() if u is None else (len(u),)), len(self.plant.states)))
             every[..., at] = part.loading if u is None else _make_component_weights(part, names).rows(u)

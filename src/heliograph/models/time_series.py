@@ -38,6 +38,7 @@ class Component(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
+        # One input for each state, which weighs it, or none.
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))
@@ -305,14 +306,17 @@ def stationary(x: "Float[ArrayLike, ' p']") -> Any:
     numbers = array("x", x, (None,))
     xp = library(numbers)
     partial = numbers / xp.sqrt(1 + numbers**2)
-    found = partial[:0]
+    found = partial[:0]  # coefficients of the order 0: none
     for k in range(len(partial)):
         found = xp.concatenate([found - partial[k] * found[::-1], partial[k : k + 1]])
     return found
 
 
 def stationary_covariance(matrix: Any, noise: Any) -> Any:
-    """Return P = F P F' + Q, by its linear equations."""
+    """Return the stationary covariance P = F P F' + Q (F: `matrix`, Q: `noise`), by linear equations for its entries.
+
+    (I - F kron F) vec P = vec Q.
+    """
     xp, n = library(matrix, noise), len(matrix)
     pairs = np.eye(n * n) - xp.kron(matrix, matrix)
     found = xp.reshape(xp.linalg.solve(pairs, xp.reshape(noise, (n * n,))), (n, n))

@@ -30,7 +30,10 @@ class TurnMotion(StepLength):
     """The motion of (x, vx, y, vy, w) over a step: the velocity turns by the angle w dt."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return (x, vx, y, vy, w) after a step: the velocity turned by w dt, its integral added to the position."""
+        """Return (x, vx, y, vy, w) after a step: the velocity turned by w dt, its integral added to the position.
+
+        w: the turn rate; `self.length(u)`: the step's length, given or an input.
+        """
         dt = self.length(u)
         angle = x[4] * dt
         along, across = dt * sine_ratio(angle), dt * cosine_ratio(angle)
@@ -48,7 +51,10 @@ class TurnNoise(StepLength):
     turn_intensity: Any
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the covariance (5, 5) of a step's noise: position and velocity of either axis, then the rate."""
+        """Return the covariance (5, 5) of a step's noise: position and velocity of either axis, then the turn rate.
+
+        `intensity` and `turn_intensity`: the variance that a velocity and the rate gain in a unit of time.
+        """
         dt = jnp.asarray(self.length(u))
         axis = self.intensity * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         rate = jnp.reshape(self.turn_intensity * dt, (1, 1))
@@ -64,7 +70,10 @@ class ArcMotion(StepLength):
     wheelbase: Any
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return (x, y, heading) after a step: the chord of the arc, in the direction half way of the turn."""
+        """Return (x, y, heading) after a step: the chord of the arc, in the direction half way of the turn.
+
+        u: speed, then the turn rate, or with a wheelbase the steering angle (radians).
+        """
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
         half = rate * dt / 2
@@ -85,9 +94,9 @@ class NoiseTimesStep(StepLength):
 
 
 def sine_ratio(angle: jax.Array) -> jax.Array:
-    """Return sin(a) / a, 1 at 0."""
+    """Return sin(a) / a, 1 at 0; below NEAR, a small angle in radians, by its series."""
     small = jnp.abs(angle) < NEAR
-    safe = jnp.where(small, 1.0, angle)
+    safe = jnp.where(small, 1.0, angle)  # so that the quotient that is not taken has derivatives, too
     return jnp.where(small, 1 - angle**2 / 6, jnp.sin(safe) / safe)
 
 

@@ -18,7 +18,7 @@ Precision = TypeAliasType("Precision", Literal["float64", "float32"])  # of the 
 
 
 def make_run_key(key: object) -> jax.Array:
-    """Return the JAX key of a seed, or the key itself; raise ValueError for anything else."""
+    """Return the JAX random key of a run from a seed, or the key itself; raise ValueError for anything else."""
     if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
         return key
     if isinstance(key, jax.Array | np.ndarray):
@@ -27,7 +27,7 @@ def make_run_key(key: object) -> jax.Array:
 
 
 def read_plant_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
-    """Return the plant's inputs, checked, as an array (horizon, inputs); None is accepted of a plant without any."""
+    """Return the plant's inputs, checked, as an array (horizon, inputs); None will do for a plant without inputs."""
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
@@ -38,7 +38,7 @@ def read_plant_inputs(network: Network, inputs: ArrayLike | None, horizon: int) 
 
 
 def check_precision(precision: object) -> None:
-    """Raise ValueError unless `precision` is the name of a precision of a run."""
+    """Raise ValueError unless `precision` is the name of a precision of a run, one of the words of its type."""
     known = get_args(Precision.__value__)
     if not isinstance(precision, str) or precision not in known:
         raise fail("precision", f"one of {', '.join(known)}", show_value(precision))

@@ -266,10 +266,10 @@ class KnownGainSums(NamedTuple):
     random: bool
 
     def find_noise_of_sums(self, outcome: ArrivalOutcome, links: JointLinks) -> Float[np.ndarray, "r r"]:
-        """Return Cov(D z) in one outcome, at x = 0 and about the mean over the outcomes that look the same.
+        """Return Cov(D z) of one outcome of the losses, at x = 0, about the mean over all outcomes that look the same.
 
-        With z = G y, y = (v, 1) at x = 0, and M the mean of G over these outcomes: E[(G y - M E y) (G y - M E y)'],
-        where the last entry of y takes G's offset.
+        D is `combine`. With z = G y, y = (v, 1) at x = 0, and M = `mean` that of G over these outcomes, it is
+        D E[(G y - M E y) (G y - M E y)'] D', where the last entry of y takes G's offset.
         """
         mean, second = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
         mean_signal = np.append(links.sensor_mean, 1.0)
@@ -317,7 +317,10 @@ def _find_known_sums(
 
 
 def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
-    """Return the reason of a certificate in words: whether the plant is stable, and the radius that gains leave."""
+    """Return in words why errors stay bounded: a stable plant, or fixed gains of this spectral radius of the error.
+
+    `a`: the plant's transition matrix.
+    """
     if spectral_radius(a) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
@@ -351,7 +354,11 @@ def _judge_unobserved_modes(
 
 
 def _explain_unbounded_error(links: JointLinks, system: KnownLossSystem, unseen: UnobservedGrowth) -> str:
-    """Return why no filter's error can stay bounded, in words: the plant's mode, and why nothing received shows it."""
+    """Return why no filter's error can stay bounded, in words: the plant's mode, and why nothing received shows it.
+
+    `unseen`: eigenvalue and eigenvectors of that mode, the modes of the chain of losses in which nothing shows it
+    (`modes`), and its growth; `system`: what is received, with the chain of all losses.
+    """
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):
@@ -370,7 +377,7 @@ def _explain_unbounded_error(links: JointLinks, system: KnownLossSystem, unseen:
 def _is_mode_excited(
     network: Network, growing: np.ndarray, known: UsableMeasurements, unseen: UnobservedGrowth
 ) -> bool:
-    """Return whether P stays above eps v v' for some eps > 0: noise keeps exciting the unseen eigenvector v.
+    """Return whether the error covariance P stays above eps v v', eps > 0: noise keeps exciting the unseen mode v.
 
     So it is if noise enters along v at once, or reaches it and every measurement has noise. The noise of random gains
     grows only where noise reaches all that is unstable, so with such gains all of `growing` must be reached too.

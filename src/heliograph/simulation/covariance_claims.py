@@ -50,7 +50,11 @@ class MistakenBelief(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The same as a sentence: "filter 'f' believes another channel than node 'a'"."""
+        """The same as a sentence: "filter 'f' believes another channel than node 'a'".
+
+        FUSED: the name under which central filters stand; RANGE, UNSAID: parts of a belief, that limits refuse
+        readings and that the filter does not say what it believes.
+        """
         place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
         reason = ", where limits refuse some" if RANGE in self.parts else ""
         preposition = "at" if self.parts == (UNSAID,) else "than"
@@ -63,7 +67,10 @@ def lower_claim(claim: Claim) -> Claim:
 
 
 def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
-    """Return a copy of the filter, and of those inside it, that claims "nominal" at most, and keeps what it claimed."""
+    """Return a copy of the filter, and of those inside it, whose covariance claims "nominal" at most.
+
+    It keeps the models that it was made for, and that its claim was lowered. "nominal": what the filter believes.
+    """
 
     def is_inner(leaf: object) -> bool:
         """Return whether this is a filter inside the filter."""
@@ -71,25 +78,26 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
 
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
     inner = [lower_to_nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
-    twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
+    twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))  # the copy, which is changed in place
     object.__setattr__(twin, "claim", lower_claim(filter.claim))
     object.__setattr__(twin, "kept", StaticPremise(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
     return twin
 
 
 def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFilter:
-    """Return the filter with its claim if it believes the world where it stands, else lowered to nominal.
+    """Return the filter as it is if it was made for the models where it stands, else one that claims "nominal" at most.
 
     Args:
-        own: the world at the place where it stands: plant, sensor, channel and trigger.
+        own: the models at the place where it stands: plant, sensor, channel and trigger.
         filter: the filter, which keeps its claim outside of the network.
     """
+    # A claim of "nominal" or less need not be lowered, whatever the filter was made for.
     is_weak = lower_claim(filter.claim) == filter.claim
     return filter if is_weak or not list_mistaken_parts(own, filter) else lower_to_nominal(filter)
 
 
 def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes, with each filter lowered to nominal that believes another world than its node's."""
+    """Return the nodes, each filter's claim lowered to "nominal" if it was made for other models than the node's."""
     results = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
@@ -101,7 +109,10 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 
 
 def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack."""
+    """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they stack.
+
+    Those of filters that know a sender's heartbeat differ: the longest decides.
+    """
     every = [filter for node in nodes.values() for filter in node.filters.values()]
     return {
         name: _replace_filters(
@@ -112,7 +123,10 @@ def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, No
 
 
 def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return the fusions, with each filter of all measurements lowered to nominal that believes another world."""
+    """Return what is fused, with each central filter's claim lowered to "nominal" that was made for other models.
+
+    A central filter receives all measurements; its models are the sensors and channels of all nodes together.
+    """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
     own = find_common_premise(network)
@@ -123,7 +137,7 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
 
 
 def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes with filters that claim "nominal" at most."""
+    """Return the nodes with copies of their filters that claim "nominal" at most: what a filter believes, no bound."""
     return {
         name: _replace_filters(node, {label: lower_to_nominal(filter) for label, filter in node.filters.items()})
         for name, node in network.nodes.items()
@@ -136,7 +150,10 @@ def make_fusions_nominal(network: HasNodes) -> dict[str, Fusion | AbstractFilter
 
 
 def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
-    """Return the node with other filters of the same names; itself where they are its own."""
+    """Return the node with other filters of the same names; itself where they are its own.
+
+    A copy without the constructor, which would check and compute all again.
+    """
     if all(filters[name] is node.filters[name] for name in filters):
         return node
     twin = copy(node)
@@ -177,7 +194,10 @@ def find_premise(network: HasNodes, name: str) -> Premise:
 
 
 def find_common_premise(network: HasNodes) -> Premise:
-    """Return plant, sensors and channels of all nodes together, in their order."""
+    """Return plant, sensors and channels of all nodes together, in their order: the models of a central filter.
+
+    `common`: the one sensor and channel that all nodes share, where there is one.
+    """
     if network.common is not None:
         return Premise(network.plant, network.common.sensor, network.common.channel)
     nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
@@ -185,7 +205,7 @@ def find_common_premise(network: HasNodes) -> Premise:
 
 
 def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
-    """Yield the filters that believe another world than that in which they stand, node after node, fused ones last.
+    """Yield the filters made for other models than those where they stand, node after node, central ones last.
 
     Args:
         network: the network.
@@ -199,7 +219,10 @@ def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
 
 
 def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, AbstractFilter]) -> Iterator[MistakenBelief]:
-    """Yield the filters of a node that claim something and were made for another world than its `own`."""
+    """Yield the filters of a node that claim something and were made for other models than its `own`, with which parts.
+
+    Those that do not say for which models they were made (no premise) are passed over, unless lowered already.
+    """
     for label, filter in filters.items():
         says = filter.premise is not None or filter.kept.lowered
         if filter.claim != "none" and says and (parts := list_mistaken_parts(own, filter)):

@@ -137,7 +137,7 @@ def run(
 
 
 def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
-    """Warn of what a record shows: no numbers, wide angles, impossible estimates, what filters left out or remark.
+    """Warn of what a record shows: values that are no numbers, wide angles, doubtful estimates, data left out, remarks.
 
     `state`: of all filters after the last row.
     """
@@ -151,7 +151,7 @@ def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyT
 
     `clock`: times of the rows.
     """
-    if smoothing is None:
+    if smoothing is None:  # the truth of a recording is not known
         return trajectories_record(network, {"truth": None, **outputs}, clock)
     return make_smoothed_record(network, smoothing, outputs, clock)
 
@@ -169,7 +169,7 @@ def _warn_of_each(lines: Sequence[str]) -> None:
 
 
 def _count_rows(measurements: ArrayLike) -> int:
-    """Return the number of rows of a node's measurements, one of a scalar; raise ValueError where there is none."""
+    """Return the number of rows of a node's measurements: 1 of a single number; raise ValueError where it is 0."""
     steps = len(measurements) if rank("measurements", measurements) else 1  # type: ignore[arg-type]
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -217,7 +217,10 @@ def _find_times(
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each output of which a filter that weighs what arrives left out most."""
+    """Yield a line for each output of which a filter that weighs what arrives left out most.
+
+    FUSED: the name under which filters of all nodes' measurements stand.
+    """
     for node, filters in record.weighed.items():
         if node == FUSED:
             names = [f"{each}: {name}" for each in record.measurements for name in network.nodes[each].received_names]
@@ -229,7 +232,10 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
 
 
 def _collect_arrivals(filters: AllFilters, reports: Reports, steps: int) -> dict[str, PyTree]:
-    """Return what arrived of reports and between neighbours in each step, by fusion, from what was recorded."""
+    """Return what arrived in each step, by fusion, from recorded `reports`: at a centre, and between neighbours.
+
+    `steps`: number of rows. What was not recorded is taken to arrive if it cannot get lost.
+    """
     reports = table("reports", reports, "reports by fusion")
     centre_arrivals: dict[str, PyTree] = {
         name: centre.uplinks.read_recorded(name, centre.nodes, reports.get(name), steps)
@@ -304,7 +310,7 @@ def _find_refused_rows(
         task: filters and all else that the recording is filtered with.
         before: rows that were refused already, by node, with the reason.
     """
-    refused, centrally = find_refused_rows(network, outputs)
+    refused, centrally = find_refused_rows(network, outputs)  # by nodes' filters, and by those of all measurements
     filters, u = task.filters, task.u
     if centrally:
         states = find_central_states_before_rows(task, grouped)

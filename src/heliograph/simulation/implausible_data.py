@@ -80,7 +80,10 @@ def step_plausibly(
         return (turn == 0) | (turn == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
-        """Step from the states before, without what the turn before judged implausible; in turn 0 that is nothing."""
+        """Return the next turn's number, and all filters stepped from `states`, those before the step, in every turn.
+
+        They step without what the turn before judged implausible; in turn 0 that is nothing.
+        """
         turn, (_, before) = carry
         after, outputs = _step_filters(filters, states, z, u, k, drawn, read_refusal_reasons(before))
         # The first turn judges all data, the second what is left of them: the first's judgements stay.
@@ -98,7 +101,7 @@ class JudgementReader:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
-        """Find, for each node, the places of its filters that receive measurements."""
+        """Find, for each node, the places among the stacked filters of those that receive measurements."""
         self._places: dict[str, list[EstimatePlace]] = {name: [] for name in network.names}
         for (node, name), place in network.places.items():
             if network.nodes[node].filters[name].received:
@@ -109,7 +112,10 @@ class JudgementReader:
         return self._stack_judgements(outputs, self._places[node], not self._places[node])
 
     def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of all filters, those of the nodes by kind and then central ones."""
+        """Return the judgements of all filters, those of the nodes by kind and then central ones.
+
+        A kind is a stack of filters of one structure, (filter, node). The last axis: the fields of a Judgement.
+        """
         places = []
         for kind, judgement in enumerate(outputs["judged"]):
             filters, nodes = judgement.distance.shape[-2:]
@@ -121,7 +127,8 @@ class JudgementReader:
     ) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of these filters, and those of the centre behind them if `central`.
 
-        Axes: the recording's, filter, field of a Judgement.
+        `places`: (kind, filter, node) of each in the stacked outputs. Axes of the result: the recording's, filter,
+        field of a Judgement.
         """
         judgements = [
             [field[..., place.filter, place.node] for field in outputs["judged"][place.kind]] for place in places
@@ -141,6 +148,8 @@ def find_refused_rows(
     network: Network, outcome: Mapping[str, PyTree]
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
     """Return the rows whose values all filters of a node refuse, with the reason: by node, and of the central filters.
+
+    A filter refuses a measurement that is implausible to it, by its judgement.
 
     Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
     what filtering the rows with judgements put out.
@@ -234,7 +243,10 @@ class _NonFiniteFunctionFinder:
 
 
 def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
-    """Return the rows in which this field of some filter's judgement is over 0."""
+    """Return the numbers of the rows in which this field of some filter's judgement is over 0.
+
+    `votes`: the judgements, whose last axis are the fields of a Judgement.
+    """
     if not votes.size:
         return []
     flagged: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()

@@ -44,7 +44,7 @@ def log_likelihood(
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum_log_likelihoods(*arguments)
-    whole = sum_filtered_in_chunks(*arguments, _judge_likelihood)
+    whole = sum_filtered_in_chunks(*arguments, _judge_likelihood)  # None where it cannot be done in chunks
     if whole is not None:
         return float(whole)
     return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))

@@ -43,7 +43,7 @@ def check_flags(name: str, filter: AbstractFilter, channels: Sequence[AbstractRa
 
 
 def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
-    """Return the filters that use flags, after the measurement in the received vector; also inside of others."""
+    """Return the filters, also inside of others, that use flags: numbers behind the measurement that say a mode."""
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
     return [
@@ -54,7 +54,7 @@ def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | M
 
 
 def _reveals_mode(affine: AbstractRandomAffine, late: bool) -> bool:
-    """Return whether a map delivers a mode: that of the step before if `late`, else that of this step."""
+    """Return whether a map delivers the mode of a memory: that of the step before if `late`, else that of this step."""
     if late:
         return isinstance(affine, OneStepLate) and isinstance(affine.base, ModeOutput)
     return isinstance(affine, ModeOutput)

@@ -152,7 +152,7 @@ class Network(Module):
         self.claimed = FrozenMapping(find_claims(self))
 
     def _check_nodes(self) -> None:
-        """Raise ValueError unless nodes and filters fit the plant, and names have distinct checksums, for draws."""
+        """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
         kind = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
             if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
@@ -165,7 +165,10 @@ class Network(Module):
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
 
     def _check_links(self) -> None:
-        """Raise ValueError unless sensors and channels fit each other; looked at is one node of each group."""
+        """Raise ValueError unless sensors and channels fit each other.
+
+        One node of each group is checked, since all nodes of a group have models of one structure.
+        """
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
@@ -173,7 +176,7 @@ class Network(Module):
                 find_received_angles(self.plant, node.sensor, node.channel)
 
     def _check_fused(self) -> None:
-        """Raise unless each fusion fits its nodes, and each central filter all that is received."""
+        """Raise ValueError unless each fusion fits its nodes, and each central filter all that is received."""
         for name, fusion in self.fused.items():
             check_states(f"fused {name!r}", fusion, self)
             if isinstance(fusion, Fusion):
@@ -268,7 +271,7 @@ class Network(Module):
         return Network(plant, nodes, fused, common=CommonReception(sensor, channel))
 
     def restricted_to(self, names: Iterable[str]) -> "Network":
-        """Return the network of a recording with measurements of these nodes alone: without the relays that lack.
+        """Return the network of a recording with measurements of these nodes alone, without relays that have none.
 
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
@@ -312,7 +315,7 @@ class Network(Module):
 
     @cached_property
     def angles(self) -> dict[str, Angles]:
-        """Places of the angles among what each node receives."""
+        """Places of the angles among the numbers that each node receives, of a channel of all its own `rows`."""
         if self.common is None:
             return {
                 name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
@@ -326,7 +329,7 @@ class Network(Module):
         return write_diagram(self)
 
     def claims(self) -> Claims:
-        """Return the claim of every estimate, by node and filter; fused ones last, under "fused"."""
+        """Return by node and filter what each estimate claims of its covariance; fused ones last, under "fused"."""
         claims: Claims = {name: {} for name in (*self.names, *([FUSED] if self.fused else []))}
         for (node, name), claim in self.claimed.items():
             claims[node][name] = claim
@@ -337,8 +340,8 @@ class Network(Module):
         return tuple(yield_mistaken_beliefs(self))
 
     def with_nominal_claims(self) -> "Network":
-        """Return the network that claims "nominal" at most, as where digits are lost that nothing bounds."""
-        lowered = copy(self)
+        """Return the network whose estimates claim "nominal" at most, as where digits are lost that nothing bounds."""
+        lowered = copy(self)  # without the constructor, which would check all again
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
         for field, value in (
             ("nodes", make_nodes_nominal(self)),
@@ -349,7 +352,10 @@ class Network(Module):
         return lowered
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
-        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel."""
+        """Return sensor, channel and the filter `name` of each node that has it and receives over a channel.
+
+        Its own, or those that are common to all nodes; a node behind relays has neither.
+        """
         nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
         sources = {label: n if isinstance(n, Node) else self.common for label, n in nodes.items()}  # None behind relays
         return {label: (s.sensor, s.channel, nodes[label].filters[name]) for label, s in sources.items() if s}

@@ -125,7 +125,8 @@ class AllFilters(Module):
     ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the first means of the filters whose estimates it fuses.
 
-        `states`: of the nodes' filters by kind. Means of one kind are (filter and node, n), filter after filter.
+        `states`: of the nodes' filters by kind, a stack of filters of one structure. Means of one kind are (filter and
+        node, n), filter after filter. `centre.sources`: (kind, number within the kind) of what it fuses.
         """
         means = []
         for kind, f in centre.sources:
@@ -135,7 +136,7 @@ class AllFilters(Module):
 
     @property
     def are_linear_and_unfused(self) -> bool:
-        """Whether no filter's gain depends on data, and nothing is fused."""
+        """Whether all filters are linear, with gains that depend on no data, and no estimates of theirs are fused."""
         filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
         fuses = self.fusions or self.centres or self.reporting or self.meshes
         return not fuses and all(filter.is_linear for filter in filters)
@@ -146,7 +147,7 @@ class AllFilters(Module):
         return tuple(centre for centre in self.centres if isinstance(centre, FusionCentre))
 
     def list_step_matrices(self, centre: FusionCentre, states: PyTree, u: jax.Array, k: jax.Array) -> list[LinearStep]:
-        """Return the matrices of step k of the filters that a centre fuses, for each of its sources.
+        """Return the matrices of step k of the filters whose estimates a centre fuses, for each of its sources.
 
         `states`: of the nodes' filters by kind, before the step. The matrices depend on covariances alone, so that
         measurements of zero do.
@@ -251,7 +252,10 @@ class AllFilters(Module):
         }
 
     def _list_details(self) -> list[tuple[str, str, str]]:
-        """Return (field of `StepOutput`, its name among the nodes' outputs, and among central filters') to put out."""
+        """Return which further results of a step are put out: those for smoothing, and judgements of measurements.
+
+        Each as (field of `StepOutput`, its name among the outputs of the nodes' filters, and of central filters).
+        """
         judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
         return (steps if self.smooths else []) + (judged if self.judges else [])
@@ -363,7 +367,7 @@ def initial_states(filters: AllFilters) -> PyTree:
 
 
 def centre_filter(network: Network, name: str) -> CentreFilter:
-    """Return the filter of the fusion centre for the fusion `name` of `network`, by `AllReports`, on nodes' reports.
+    """Return the filter of the centre that fuses all nodes' reports, for the fusion `name` by `AllReports`.
 
     The measurement is, joined: of each node in the network's order what arrives of the report of this step, then of
     that of the step before if links may be a step late, and so on; NaN for what did not arrive. A quantizer enters by

@@ -27,7 +27,10 @@ class EstimatePlace(NamedTuple):
 def find_estimate_places(
     groups: Sequence[Sequence[str]], kinds: Sequence[AlikeFilters]
 ) -> dict[tuple[str, str], EstimatePlace]:
-    """Return the place of each estimate, by node and filter."""
+    """Return the place of each estimate in the stacks of filters, by node and name of the filter.
+
+    `groups`: names of the nodes of one structure. `kinds`: filters of one structure at the nodes of a group.
+    """
     return {
         (node, name): EstimatePlace(kind=k, filter=f, node=i)
         for k, kind in enumerate(kinds)
@@ -37,7 +40,7 @@ def find_estimate_places(
 
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Return names in groups, by the structure of their items, in order of first appearance."""
+    """Return names in groups of items that differ in numbers alone, in order of first appearance."""
     results: dict[object, list[str]] = {}
     for name, described in items:
         results.setdefault(structure_key(described), []).append(name)
@@ -47,7 +50,10 @@ def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, 
 def list_alike_filters(
     groups: Sequence[Sequence[str]], filters: Mapping[str, Mapping[str, object]]
 ) -> tuple[AlikeFilters, ...]:
-    """Return the kinds of filters, group after group; `filters` are those of each node, which are alike in a group."""
+    """Return the kinds of filters, those of one structure at the nodes of one group, group after group.
+
+    `filters`: of each node, by node and name; nodes of a group have alike ones, so its first node tells for all.
+    """
     return tuple(
         AlikeFilters(g, alike)
         for g, names in enumerate(groups)
@@ -56,7 +62,10 @@ def list_alike_filters(
 
 
 def list_alike_meshes(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequence[str]]) -> tuple[AlikeFilters, ...]:
-    """Return the kinds of fusions between neighbours, sorted as in compiled code; `meshes` are those of each node."""
+    """Return each fusion between neighbours at each group of nodes that takes part in it, as a kind of one filter.
+
+    Sorted by name, as compiled code has them. `meshes`: names of the fusions of each node.
+    """
     every = sorted({mesh for of_node in meshes.values() for mesh in of_node})
     return tuple(
         AlikeFilters(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]]

@@ -130,7 +130,10 @@ class Node(Module):
 
     @property
     def predictor(self) -> str | None:
-        """Name of the filter whose prediction the sender compares with; None where it compares with none."""
+        """Name of the filter with whose prediction the sender compares what it measured, to decide whether to send.
+
+        None where it compares with none.
+        """
         if self.trigger is None or self.trigger.reference != "prediction":
             return None
         return next(name for name, filter in self.filters.items() if compares_with_prediction(filter, self.trigger))
@@ -147,7 +150,11 @@ class Node(Module):
 
     @property
     def received_names(self) -> tuple[str, ...]:
-        """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT"."""
+        """Names of the components of the measurement: values, side information, then dithers "dither_OUTPUT".
+
+        A dither is noise that an encoder adds before rounding, and the receiver subtracts. FLAG: a number that carries
+        no output.
+        """
         channel = first(self.channel)
         if self.encoder is None or not self.encoder.subtracts:
             return name_received_values(self.outputs, channel, self.received - channel.outputs)
@@ -271,7 +278,9 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
 
 
 def check_states(name: str, filter: object, network: HasNodes) -> None:
-    """Raise ValueError unless a filter has as many states and inputs as the plant, and it, or a fusion, its attitudes.
+    """Raise ValueError unless a filter has as many states and inputs as the plant, and its attitudes are the plant's.
+
+    A fusion is asked for its attitudes alone.
 
     `name`: of the filter or fusion, for errors.
     """
@@ -306,7 +315,7 @@ def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:
-    """Raise ValueError for filters that are none, or that do not receive as many components as their node."""
+    """Raise ValueError for objects that are no filters, or that do not receive as many components as their node."""
     for name, filter in filters.items():
         check_type(f"filter {name!r}", filter, AbstractFilter)
         if isinstance(filter, AbstractFilter):
@@ -314,7 +323,10 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 
 
 def get_parts_of_reception(node: Node | ReceivingNode) -> object:
-    """Return the parts of a node that determine its measurements; nodes where their structure is one are a group."""
+    """Return the parts of a node that determine its measurements.
+
+    Nodes where these have one structure, and differ in numbers alone, are simulated as a group.
+    """
     if isinstance(node, Node):
         places = None if node.encoder is None else find_carried_components(node.channel)
         link = drop_names(node.channel)

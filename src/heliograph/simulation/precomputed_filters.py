@@ -17,7 +17,10 @@ from heliograph.smoothing.forward_and_backward_pass import plan_with_smoother_st
 
 
 def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
-    """Return the filters with all that depends on no data precomputed for inputs u, where all data arrive."""
+    """Return the filters with all that depends on no data, such as gains, computed before for inputs u.
+
+    Only of filters whose nodes always receive all data (`complete`, by group); central filters receive all nodes'.
+    """
     planned = [_precompute_stack(a, u) if filters.complete[a.group] else a for a in filters.alike]
     central = filters.central if all(filters.complete) else {}
     central = {
@@ -29,12 +32,16 @@ def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -
 
 
 def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
-    """Return filters that differ in numbers alone, planned by one program: native code, or XLA's where it must be."""
+    """Return a stack of filters with all that depends on no data computed before, for the steps of inputs u.
+
+    By one program for all: this library's native code, or XLA's where that refuses.
+    """
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
         choice = choose_code(_precompute_filter, arguments, (True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
+    # What is the same for all filters is computed once, and repeated for each.
     planned = map_arrays(lambda leaf: np.broadcast_to(leaf, (count, *leaf.shape[1:])), choice.results())
     return replace(alike, filters=planned)
 

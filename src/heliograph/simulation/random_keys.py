@@ -13,7 +13,10 @@ Number = int | jax.Array | np.ndarray
 
 
 def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax.Array:
-    """Return the key of one draw: step, source and purpose are folded in, so that draws do not depend on each other."""
+    """Return the key of one draw of a run: step k, source and purpose are folded in, so that draws are independent.
+
+    `source`: checksum of the name of what draws; `purpose`: number of what is drawn.
+    """
     for number in (k, source, purpose):
         run_key = jax.random.fold_in(run_key, number)
     return run_key

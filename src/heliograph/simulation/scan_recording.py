@@ -52,7 +52,11 @@ class FilteringTask(NamedTuple):
         return self.filters.init() if self.begin is None else jax.tree.map(jnp.asarray, self.begin.states)
 
     def rows(self, z: tuple[np.ndarray, ...]) -> tuple[PyTree, ...]:
-        """Return the rows, with a leading axis of steps: their numbers, inputs, measurements z, and what arrived."""
+        """Return the rows, with a leading axis of steps: their numbers, inputs, measurements z, and what arrived.
+
+        Numbers begin at 0, or go on from the last step of an earlier recording (`begin`). What arrived: of reports to a
+        centre and between neighbours.
+        """
         numbers: Array = jnp.arange(len(self.u))
         if self.begin is not None:
             numbers = self.begin.step + numbers
@@ -91,7 +95,7 @@ def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
     if origin is None:  # nothing is before them
         return clock
     last, first = np.asarray(origin.time), clock[0]
-    if last.dtype.kind != clock.dtype.kind or first < last:
+    if last.dtype.kind != clock.dtype.kind or first < last:  # a date and a number, or times that go backwards
         raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
     return np.append(last, clock)
 
@@ -137,6 +141,7 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
     """
     if task.smoother is not None or not task.filters.are_linear_and_unfused:
         return None
+    # Where rows are more of a recording, they begin at its last states and step.
     begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
     filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
@@ -183,7 +188,11 @@ def _scan_rows(
     """
 
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Step all filters over one row."""
+        """Return the states of all filters after one row, and what they made of it.
+
+        The row: step, inputs, measurements, what arrived, and a flag. False leaves the states as they are, as rows
+        that only fill up a scan do; None: all rows count. `judged`: what is implausible is left out.
+        """
         (k, u_k, z_k, drawn), row_is_counted = row
         step = step_plausibly if judged else AllFilters.step
         after, results = step(filters, states, z_k, u_k, k, drawn)
@@ -198,7 +207,10 @@ def _scan_rows(
 def _collect_results(
     smoother: NetworkSmoother | None, z: tuple[np.ndarray, ...], state: PyTree, results: dict[str, PyTree]
 ) -> PyTree:
-    """Return what `filter_rows` does from the filters' `results` by row and their last `state`, smoothed if to be."""
+    """Return what `filter_rows` does: the filters' `results` by row, measurements z and their last `state`.
+
+    With a smoother the results are smoothed, but for the judgements of measurements ("judged"), which stay as they are.
+    """
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
     return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
@@ -210,10 +222,16 @@ def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ..
 
 
 def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
-    """Return what `find_central_states_before_rows` does, by a scan over the rows."""
+    """Return the states of the central filters, those of all measurements, before each row, by a scan over the rows.
+
+    z: measurements (steps, node, received) by group of nodes.
+    """
 
     def step(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-        """Step all filters; the central ones' states before the step are the output."""
+        """Return the states of all filters after a row, and those of the central filters before it.
+
+        The row: step, inputs, measurements, and what arrived of reports.
+        """
         k, u_k, z_k, drawn = row
         after, _ = step_plausibly(task.filters, states, z_k, u_k, k, drawn)
         _, central, *_ = states

@@ -87,6 +87,7 @@ def _describe_refused(
         refused: number of the reason of each reading, 0 where it is kept.
         node: the node.
     """
+    # The readings that were refused for this reason alone, in the first row that has some.
     here = np.where(refused == number_of_reason(reason), refused, 0)
     row, came = int(np.argmax(here.any(axis=1))), int(np.count_nonzero(~np.isnan(z)))
     why = limits.describe_missing(z[row], here[row], node.received_names)

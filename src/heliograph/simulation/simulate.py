@@ -142,7 +142,7 @@ def _has_long_step(network: "Network") -> bool:
 
 
 def _return_with_warnings(result: Result, network: Network) -> Result:
-    """Return the result as it is; warn where a record holds what is no number, or a state beyond its limits."""
+    """Return the result as it is; warn where it is a record with values that are no numbers or states beyond limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
@@ -151,7 +151,10 @@ def _return_with_warnings(result: Result, network: Network) -> Result:
 
 
 def _warn_beyond_limits(record: Record, network: Network) -> None:
-    """Warn where a true state is beyond the limits that filters believe, which the plant itself does not keep."""
+    """Warn where a simulated state is beyond the limits that the plant states, and filters use.
+
+    A simulation does not enforce them: the plant's transition and noise have to.
+    """
     for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
         x = np.asarray(record.truth)[..., network.states.index(name)]
         beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
@@ -163,7 +166,10 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
-    """Raise ValueError for counts that are no positive integers, and for a first run within a block."""
+    """Raise ValueError for counts that are no positive integers, and for a first run within a block of BLOCK runs.
+
+    Runs are simulated in blocks, so that results do not depend on where a series of runs was begun.
+    """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
     if check_count("first_run", first_run, 0) % BLOCK:
@@ -171,7 +177,10 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
 
 
 def _warn_of_numbers_lost_in_float32(network: Network) -> None:
-    """Warn if all numbers of some covariance or matrix of plant and sensors are 0 in single precision."""
+    """Warn if all numbers of some array of plant and sensors, not all 0, are too small for single precision.
+
+    They would count as 0.
+    """
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
     if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
@@ -235,13 +244,14 @@ def _simulate_lane(todo: tuple[_SimulationJob, PyTree], carry: PyTree) -> tuple[
 
 
 def _simulate_blocks(job: _SimulationJob, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
-    """Simulate blocks (block, BLOCK) of runs in turn: return the carry with their sums, and what is collected.
+    """Return the carry, the sums so far, with those of some blocks of runs, and what is collected of these.
 
-    Width and order of the sums are fixed, so that chunks do not change a bit.
+    `blocks`: numbers of the runs (block, BLOCK). Blocks are summed one after another, so that no bit depends on how
+    runs are dealt to calls.
     """
 
     def add_block(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
-        """Simulate one block: return the carry with its sums, and what is collected of it."""
+        """Return the carry with the sums of one more block of runs, and what is collected of it."""
         sums, collected = _simulate_block(job, runs)
         return add_sums(carry, sums), collected
 
@@ -262,9 +272,9 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
 
     def sum_by_batch(leaf: jax.Array) -> PyTree:
-        """Return the sums over each batch (..., batch) of `leaf` (run, ...), without runs beyond the last.
+        """Return the sums over each batch of runs (..., batch) of `leaf` (run, ...), without runs beyond the last.
 
-        What all runs share, (1, ...), is not summed.
+        `valid`: which runs count, `start`: batch of the first. What all runs share, (1, ...), is not summed.
         """
         if len(leaf) < len(runs):
             return SharedResult(leaf[0].astype(float))
@@ -276,10 +286,13 @@ def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree,
 
 
 def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
-    """Return trajectories of one block of runs, (run, time, ...), in double precision whatever simulated them."""
+    """Return all outputs of one block of runs, (run, time, ...), in double precision, whichever simulated them.
+
+    `runs`: their numbers.
+    """
     if job.precision == "float64":
         return _simulate_trajectories(job.world, job.inputs, job.key, runs)
-    with jax.enable_x64(False):
+    with jax.enable_x64(False):  # so that JAX computes in single precision
         world, inputs = jax.tree.map(_convert_to_single, (job.world, job.inputs))
         outputs = _simulate_trajectories(world, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
@@ -310,7 +323,8 @@ def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory
 def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     """Return values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none.
 
-    Runs beyond the last batch go on from the first: one row of batches, with what is beyond its end added to its begin.
+    Each run goes to the next batch, and runs beyond the last batch (BATCHES) go on from the first: one row of batches,
+    with what is beyond its end added to its begin.
     """
     runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
     row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)

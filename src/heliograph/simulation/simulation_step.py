@@ -36,8 +36,8 @@ class World(Module):
     def init(self, key: jax.Array) -> PyTree:
         """Return the state before the first step of the run with this key.
 
-        A tuple: state x of the plant (n,); of the medium; of all filters; of the links between neighbours, by fusion;
-        of the plant's memories.
+        A tuple: state x of the plant (n,); of the medium, which is all channels; of all filters; of the links between
+        neighbours, by fusion; of the plant's memories, its modes.
         """
         plant = at(self.plant, 0)
         if isinstance(plant, ModalPlant) and plant.rates is not None:
@@ -97,7 +97,7 @@ def _turn_angles_to_truth(plant: AbstractPlant, x: jax.Array, outputs: dict[str,
         return outputs
 
     def turn(estimate: Estimate) -> Estimate:
-        """Return an estimate with its angles near those of x."""
+        """Return an estimate with its angles within half a turn of those of x, the true state."""
         return replace(estimate, mean=plant.near(jnp.asarray(estimate.mean), x))
 
     estimates = {key: outputs[key] for key in ("estimates", "fused")}

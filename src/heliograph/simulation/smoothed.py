@@ -99,7 +99,7 @@ def _turn_angles_to_truth(
     """
 
     def turn(estimate: Estimate, angles: Angles) -> Estimate:
-        """Return an estimate (time, ..., n) with its angles turned."""
+        """Return an estimate (time, ..., n) with its angles within half a turn of those of the truth (time, n)."""
         mean = jnp.asarray(estimate.mean)
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
         return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
@@ -114,7 +114,7 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
     """Return the fused estimates (time, ...) by name, of estimates (time, filter, node, ...) by kind."""
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-        """Return the fused estimates of one time, by name."""
+        """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by kind."""
         _, fused, _ = fusion.step((), estimates, jnp.asarray(0))
         return fused
 
@@ -125,7 +125,8 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
 def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
     """Return what a reducer makes of a run's `outputs` (time, ...); with a smoother, pairs: of filtered, of smoothed.
 
-    Its sums then end with those of the NIS.
+    `later` smooths a whole run. The sums then end with those of the NIS, the normalised innovations squared, by which
+    the filters are tested.
     """
     if later is None:
         return reduce_rows(reducer, outputs)
@@ -199,7 +200,7 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
-    """Return the claim of a filter's smoothed estimates, from the shape of a step, without computing one."""
+    """Return the claim of a filter's smoothed estimates, as a smoother step has it; only its shape is computed."""
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
@@ -231,7 +232,10 @@ def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | Abstract
 
 
 def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
-    """Warn of filters that are not consistent, from sums of the NIS as `smooth_run` returns them, over all runs."""
+    """Warn of filters that are not consistent, from sums of the NIS as `smooth_run` returns them, over all runs.
+
+    The NIS, the normalised innovation squared, is about its number of components where a filter's claim is right.
+    """
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
             for i, node in enumerate(network.groups[group]):
@@ -251,6 +255,7 @@ def make_smoothed_record(network: Network, smoothing: SmoothingPlan, outputs: Py
     """
     _warn_of_inconsistency(smoothing.network, outputs["nis"])
     filtered = trajectories_record(network, {"truth": None, **outputs["filtered"]}, time)
+    # The smoothed part may be of the last rows alone.
     length = outputs["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(smoothing.network, {"truth": None, **outputs["smoothed"]}, time[-length:])
     return Trajectories().others(filtered, smoothed, smoothing.claims)
@@ -263,7 +268,7 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
     """
 
     def turn(estimate: Estimate, x: np.ndarray) -> Estimate:
-        """Return an estimate with its angles near those of x, where x is known."""
+        """Return an estimate with its angles within half a turn of those of the true state x, where x is known."""
         mean = np.asarray(estimate.mean)
         known = np.where(np.isnan(x), mean, x)
         return replace(estimate, mean=first(plant).near(mean, known))

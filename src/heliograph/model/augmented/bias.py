@@ -134,7 +134,10 @@ class DrivenTransition(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state after a step."""
+        """Return the state [x; b] after a step: x moves as the plant says, plus `coupling` times the biases b.
+
+        The biases move by a plant of their own, whose inputs stand at `places` of u.
+        """
         n = len(self.plant.states)
         moved = self.plant.transition(x[:n], u) + jnp.asarray(self.coupling) @ x[n:]
         return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
@@ -195,7 +198,7 @@ def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, coupling: np.nd
         return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), of_bias]])
 
     def drive(u: jax.Array) -> jax.Array:
-        """Return [B; B_b] under the inputs u."""
+        """Return [B; B_b] under the inputs u: of the plant, and of the biases, whose inputs `pick` takes out of u."""
         return jnp.concatenate(
             [matrix_under_inputs(plant.input_matrix, u), matrix_under_inputs(bias.input_matrix, pick @ u) @ pick]
         )
@@ -216,7 +219,7 @@ class BiasedMeasurement(Module):
 
 
 def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int) -> LinearSensor | Sensor:
-    """Return the sensor y = h(x) + D b + v of [x; b], D the loading and `states` the length of x."""
+    """Return the sensor y = h(x) + D b + v of the state [x; b], b the biases, D `loading`, `states` the length of x."""
     if not isinstance(sensor, LinearSensor):
         return Sensor(BiasedMeasurement(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
     stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
@@ -224,7 +227,7 @@ def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int
 
 
 def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
-    """Return the values of the biases, from one or from as many."""
+    """Return a list of `count` values, one for each bias, from one value for all or from as many."""
     given: Any = value
     values = list(given) if rank(name, value) else [given] * count
     if len(values) != count:

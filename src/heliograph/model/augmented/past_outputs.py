@@ -21,7 +21,7 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
 
     y+ = C (A x + B u + w) + v is a state with its noise, so that one y received twice is known to be one. Past states x
     instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
-    The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
+    The new channel takes y_k, ..., y_{k-D} and draws as the late one does; any filter of linear plants takes the three.
 
     Args:
         plant: linear.

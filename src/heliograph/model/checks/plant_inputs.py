@@ -39,7 +39,11 @@ class TimeStepFault(NamedTuple):
 
 
 def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> TimeStepFault | None:
-    """Return the first time step that is none: one that goes backwards, a counter that wrapped, one beyond 2^53."""
+    """Return the first time step that cannot be one, or None: it goes backwards, is beyond 2^53, or a counter wrapped.
+
+    LONGEST: 2^53. WRAPPED: 2^32, near which a negative difference of unsigned counters of 32 bits lies. SMALLER: counts
+    in a unit of dt, of counters in milliseconds and microseconds.
+    """
     bad = ~np.asarray(_is_time_step(dt))
     if not bad.any():
         return None
@@ -71,9 +75,10 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 
 
 def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
-    """Return whether each number is from 0 to 2^53, and no difference of unsigned counters below zero.
+    """Return whether each number can be a time step: from 0 to 2^53 (LONGEST), and no counter that wrapped.
 
-    `precision`: of the numbers.
+    One below zero that unsigned counters of 32 bits give reads just below 2^32: within NEAR for whole numbers, or
+    within CLOSE where dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
     """
     wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
     for counts in SMALLER:
@@ -115,7 +120,7 @@ def check_inputs(
 
 
 def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
-    """Yield the sensors that depend on some of these inputs, and the places of those."""
+    """Yield the sensors in models that depend on inputs, all of them among `names`, with their places in `names`."""
     for sensor in yield_models_of_class(models, AbstractSensor):
         own = first(sensor).inputs
         if own and set(own) <= set(names):
@@ -129,7 +134,7 @@ def yield_plants(models: PyTree) -> Iterator[AnyPlant]:
 
 
 def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
-    """Yield what a model object holds of a class of models, constant or over time."""
+    """Yield the models of a class, such as sensors, that a model object holds, constant or over time."""
 
     def is_part(part: object) -> bool:
         """Return whether an object is of the class, constant or over time."""
@@ -181,7 +186,10 @@ def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
 def _check_functions_of_inputs(
     plant: AnyPlant | AnySensor, u: Float[np.ndarray, "steps inputs"], steps: np.ndarray
 ) -> None:
-    """Raise ValueError that names the row whose inputs u give a matrix that is not finite, or no covariance."""
+    """Raise ValueError that names the row whose inputs u give a matrix that is not finite, or no covariance.
+
+    COVARIANCES: names of the matrices that must be covariances. `steps`: the step of each row.
+    """
     functions = _list_functions_of_inputs(first(plant))
     parts = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
     for name, values in zip(functions, map(np.concatenate, zip(*parts, strict=True)), strict=True):
@@ -200,7 +208,7 @@ def _evaluate_in_blocks_of_steps(
     u: Float[np.ndarray, "steps inputs"],
     steps: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield what functions return, some steps at a time."""
+    """Yield what functions of the inputs return, for ROWS steps at a time, so that memory stays bounded."""
     for start in range(0, len(u), ROWS):
         yield _evaluate_at_steps(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
 
@@ -209,7 +217,10 @@ def _evaluate_in_blocks_of_steps(
 def _evaluate_at_steps(
     plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
-    """Return what functions return at each step, each (steps, n, m): compiled, for operation by operation is slow."""
+    """Return the matrices of each function at each step, (steps, n, m), under the inputs u of that step.
+
+    Compiled, for operation by operation is slow.
+    """
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
         """Return what the functions return at step k."""
@@ -229,7 +240,7 @@ def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarr
     """Return which matrices (steps, n, n) are no covariances, by the tolerances of `check.covariance`."""
     finite = np.isfinite(values).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], values, 0.0)
-    unit = standard_deviations(safe)
+    unit = standard_deviations(safe)  # so that tolerances do not depend on the states' units
     correlations = safe / (unit[:, :, None] * unit[:, None, :])
     skew = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0.0)
     smallest = np.linalg.eigvalsh((correlations + np.swapaxes(correlations, 1, 2)) / 2)[:, 0]
@@ -263,7 +274,10 @@ def do_inputs_spoil(
 
 
 def _returns_invalid_value(model: AbstractPlant | AbstractSensor, u: jax.Array, precision: type | None) -> jax.Array:
-    """Decide whether a function of a model's inputs returns what is none."""
+    """Decide whether a matrix that a model computes from its inputs u is no covariance, or not finite.
+
+    COVARIANCES: names of the matrices that must be covariances. `precision`: type of the numbers, for tolerances.
+    """
     spoilt = jnp.asarray(False)
     for name, function in _list_functions_of_inputs(model).items():
         value = function(model, u)

@@ -41,7 +41,7 @@ def number_of_reason(reason: Reason) -> int:
 
 
 def count_by_reason(refused: Int[np.ndarray, "time m"]) -> dict[Reason, Int[np.ndarray, " m"]]:
-    """Count the readings of each component that are refused, by reason that there is.
+    """Count the refused readings of each component (m,), by reason; reasons for which none was refused are left out.
 
     Args:
         refused: the number of the reason of each reading, 0 of one that is kept (time, m).

@@ -37,7 +37,7 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
 
 
 def warn_of_unequal_steps(inputs: Sequence[str], clock: np.ndarray | None) -> None:
-    """Warn where steps between times differ and the plant, without the input dt, takes each row for one step.
+    """Warn where times are not equally spaced, but the plant, without the input dt, takes each row for one step.
 
     Args:
         inputs: names of the plant's inputs.
@@ -63,7 +63,10 @@ def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.nd
 
 
 def _count_frames_up_to_user() -> int:
-    """Return how many frames above the function that calls it the user's are: the first outside this package."""
+    """Return the `stacklevel` with which a warning of the caller points at the user's line, outside this package.
+
+    It counts the frames of this package from here up.
+    """
     package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, depth = frame.f_back, depth + 1

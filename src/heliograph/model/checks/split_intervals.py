@@ -23,7 +23,9 @@ def find_indivisible_part(
     channel: Channel | None = None,
     trigger: AbstractTrigger | None = None,
 ) -> str:
-    """Return the name of the part of a model whose law goes by steps, so that a row in between changes it; "" if none.
+    """Return the part of a model whose law goes by steps, not by time, in words for an error; "" if there is none.
+
+    A row inserted in between would change such a law.
 
     Args:
         plant: the plant; each of these may be None, where it is not asked about.
@@ -84,7 +86,10 @@ def _predict_over_intervals(
     """
 
     def integrate(parts: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean, transition matrix and noise covariance after intervals of these lengths."""
+        """Return mean, transition matrix and noise covariance after intervals of these lengths, one after another.
+
+        x: the mean before them; `dt`: the number of the input that is the length, all other inputs being 1.
+        """
         n = len(x)
         state, matrix, spread = jnp.asarray(x), jnp.eye(n), jnp.zeros((n, n))
         for interval in parts:

@@ -74,9 +74,11 @@ def list_differences(believed: Premise, own: Premise) -> tuple[str, ...]:
 
 
 def _enlarge_world_by_past(believed: Premise, own: Premise) -> Premise:
-    """Return the world `own` with past signals as states, where the filter was made for such a larger plant.
+    """Return the models `own` of a node with past signals as states, where the filter was made for such a larger plant.
 
-    Of these states it estimates the first, x itself.
+    Args:
+        believed: the models that the filter was made for.
+        own: plant, sensor and channel where it stands; returned as they are unless the channel is late (`past` steps).
     """
     if own.sensor is None or own.channel is None or not first(own.channel).past:
         return own
@@ -112,7 +114,10 @@ def restrict_premise_to_rows(premise: Premise, rows: Sequence[int]) -> Premise:
 
 
 def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
-    """Decide whether two models agree at each step; one that does not vary is the same at all of them."""
+    """Decide by `agree(a, b, order)` whether two models agree at each step; a constant one is the same at all of them.
+
+    `order`: of the moments that a filter uses, None for the whole law.
+    """
     if are_same(a, b):
         return True
     if steps_covered((a, b)) is None:
@@ -122,7 +127,7 @@ def _agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order:
 
 
 def _same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
-    """Return whether noises agree in what a filter uses of them: all of their law, or mean and covariance."""
+    """Return whether noises agree in what a filter uses of them: all of their law, or mean and covariance (`order`)."""
     if are_same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
@@ -149,7 +154,7 @@ def _same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
 
 
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
-    """Return whether plants move a state alike: by equal matrices, or by the same function."""
+    """Return whether two plants move a state alike: by equal matrices, or by the same function of state and inputs."""
     linear = [plant for plant in (a, b) if isinstance(plant, LinearPlant)]
     if len(linear) == 2 and not any(isinstance(m, MatrixOfInputs) for p in linear for m in (p.matrix, p.input_matrix)):
         return equal_to_rounding(linear[0].matrix, linear[1].matrix) and equal_to_rounding(
@@ -159,7 +164,10 @@ def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
 
 
 def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
-    """Return whether two plants' process noises agree, as laws or as functions of the inputs."""
+    """Return whether two plants' process noises agree, as laws, or by covariances as functions of the inputs.
+
+    `order`: of the moments that a filter uses, None for the whole law.
+    """
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         return _same_noise(a.noise, b.noise, order)
     return same_function(a.noise_covariance, b.noise_covariance, (len(a.inputs),))
@@ -185,7 +193,10 @@ def _same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> boo
 
 
 def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
-    """Tell whether two sensors that depend on inputs are the same programs of state and inputs."""
+    """Return whether two sensors that depend on inputs are the same programs of state and inputs, with like noise.
+
+    `order`: of the moments of noise that a filter uses, None for its whole law.
+    """
     if a.inputs != b.inputs or a.angles != b.angles or len(a.outputs) != len(b.outputs):
         return False
     u = (len(a.inputs),)
@@ -226,7 +237,10 @@ def _takes_states(sensor: AbstractSensor, states: int) -> bool:
 
 
 def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
-    """Return the matrix of a linear sensor, or of linear ones one above the other; None of any other."""
+    """Return the matrix of a linear sensor, or of linear ones stacked into one.
+
+    None of any other, of a matrix that depends on inputs, and of one that JAX traces.
+    """
     if isinstance(sensor, LinearSensor):
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
     parts = [find_sensor_matrix(part) for part in sensor.parts] if isinstance(sensor, JointSensor) else [None]
@@ -236,7 +250,8 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
 def _same_trigger(believed: AbstractTrigger | None, own: AbstractTrigger | None) -> bool:
     """Return whether the sender's rule is the one that the filter believes.
 
-    A filter that believes in none agrees with a schedule: what is not sent by it is missing whatever its value.
+    A filter that believes in no rule agrees with a schedule (Periodic): what is not sent then is missing whatever its
+    value, and says nothing about it.
     """
     if believed is None:
         return own is None or isinstance(own, Periodic)
@@ -251,7 +266,11 @@ def _same_gains(believed: Premise, own: Premise) -> bool:
 def _same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
     """Decide whether two channels agree; memories count as the same where they stand at the same place.
 
-    `loses`: whether they may differ in what is lost, which a filter sees.
+    Args:
+        a: a channel, constant or over time.
+        b: the other.
+        order: of the moments that a filter uses, None for the whole law.
+        loses: whether they may differ in what is lost, which the filter sees.
     """
     if a is b:
         return True
@@ -286,7 +305,7 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 
 
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Decide whether two maps are the same but for what is lost; False where losses depend on gains."""
+    """Decide whether two maps are the same but for what is lost; False where losses depend on gains (a ValueError)."""
     try:
         return are_same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:
@@ -294,9 +313,9 @@ def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> boo
 
 
 def _same_moments(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Decide whether E[(G, n)] and Cov(z | y) of what arrives through b are those of a, at every step.
+    """Decide whether E[(G, n)] and Cov(z | y) of what arrives of z = G y + n through b are those of a, at every step.
 
-    Bounds of laws would have to be compared as laws.
+    False where noise is known by a bound in one of them alone: bounds would have to be compared as laws.
     """
     if has_bounded_noise(a) != has_bounded_noise(b):
         return False
@@ -331,7 +350,10 @@ def _take_moments_by_arrival(channel: AbstractRandomAffine) -> list[tuple[np.nda
 
 
 def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
-    """Decide whether moments of the components that arrived are equal to rounding, each in units of its own size."""
+    """Decide whether moments of the components that arrived are equal to rounding (EQUAL), each relative to its size.
+
+    Each of a and b: E[(G, n)] (m, p + 1) and E[z z' | y] as a tensor (m, m, p + 1, p + 1) of the entries of (y, 1).
+    """
     (mean_a, second_a), (mean_b, second_b) = a, b
     rows = np.ix_(arrived, arrived)
     powers = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]
@@ -344,7 +366,10 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
 def _same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Decide whether what is received of the state agrees, though sensors and channels are written in other ways."""
+    """Decide whether two pairs of sensor and channel deliver alike of the state, though they are written differently.
+
+    Only for filters that use mean and covariance (`order`): then each pair is compared as one map from the state.
+    """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
     maps = [whole for observation in (a, b) if (whole := _compose_with_sensor(*observation)) is not None]
@@ -354,7 +379,7 @@ def _same_observation(
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
-    """Return the map from the state to what is received, of a linear sensor without angles."""
+    """Return the map from the state to what is received; None unless the sensor is linear, without angles or delays."""
     matrix = find_sensor_matrix(sensor)
     if matrix is None or sensor.angles or channel.past:
         return None

@@ -64,7 +64,7 @@ class Premise:
         self.encoder = encoder
 
     def replaced(self, **parts: Any) -> "Premise":
-        """Return the premise with other parts, by name."""
+        """Return the premise, the models that a filter was made for, with other parts: plant=..., sensor=..., ..."""
         other = copy(self)
         other.__dict__.update(parts)
         return other
@@ -141,10 +141,14 @@ def believes(make: Callable[P, B]) -> Callable[P, B]:
 
     @wraps(make)
     def build(*args: P.args, **kwargs: P.kwargs) -> B:
-        """Make the filter, and keep with it the plant, sensor, channel, trigger and encoder among the arguments."""
+        """Make the filter, and keep with it the plant, sensor, channel, trigger and encoder among the arguments.
+
+        `make`: the decorated function, `parameters` its signature, `parts` the names of these five.
+        """
         given = parameters.bind(*args, **kwargs).arguments
         premise = Premise(**{name: given[name] for name in parts if name in given})
         if premise.sensor is not None and premise.channel is None:
+            # Without a channel the sensor's outputs are received as they are.
             premise.channel = perfect(len(first(premise.sensor).outputs))
         return with_premise(make(*args, **kwargs), premise)
 

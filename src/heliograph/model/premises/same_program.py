@@ -31,7 +31,10 @@ def same_function(f: Callable[..., Any], g: Callable[..., Any], *shapes: tuple[i
 
 
 def _same_parameter(a: Any, b: Any) -> bool:
-    """Tell whether parameters of two operations are the same: programs by what they compute, others by value."""
+    """Return whether parameters of two operations are the same: inner programs (jaxprs) by their operations.
+
+    All other parameters are compared by value, lists entry by entry.
+    """
     if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
         return are_same(list(a.consts), list(b.consts)) and _same_program(a.jaxpr, b.jaxpr)
     if isinstance(a, core.Jaxpr) and isinstance(b, core.Jaxpr):
@@ -42,7 +45,10 @@ def _same_parameter(a: Any, b: Any) -> bool:
 
 
 def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
-    """Tell whether two programs do the same operations in the same order, whatever their variables are called."""
+    """Return whether two programs (jaxprs) do the same operations in the same order, whatever variables are called.
+
+    Variables get numbers in the order in which they appear. ASIDE: parameters that change no result, such as labels.
+    """
     if len(a.eqns) != len(b.eqns):
         return False
     names: tuple[dict[Any, int], dict[Any, int]] = {}, {}
@@ -65,14 +71,20 @@ def _number_variables(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[
 
 
 def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> bool:
-    """Return whether lists of operands are the same, one by one (`_same_atom`)."""
+    """Return whether lists of operands of two operations are the same, one by one (`_same_atom`).
+
+    `names`: for both programs the number of each variable.
+    """
     if len(a) != len(b):
         return False
     return all(_same_atom(names, x, y) for x, y in zip(a, b, strict=True))
 
 
 def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
-    """Return whether operands are equal constants, or the same variables by the names of both programs."""
+    """Return whether operands are equal constants, or variables of one number and type.
+
+    `names`: for both programs the number of each variable, in the order in which they appear.
+    """
     if isinstance(x, core.Literal) and isinstance(y, core.Literal):
         return are_same(np.asarray(x.val), np.asarray(y.val))
     if isinstance(x, core.Literal) or isinstance(y, core.Literal):

@@ -111,7 +111,10 @@ class Words(Module):
         return spread
 
     def draw_dither(self, key: jax.Array, outputs: int) -> Float[jax.Array, " outputs"]:
-        """Draw the dither of one message."""
+        """Draw the dither of one message: for each output noise that is added before it is rounded to a word.
+
+        "none", "triangular" (the sum of two uniform ones) or uniform, in units of `step`, the distance of two words.
+        """
         drawn = jax.random.uniform(key, (2, outputs), dtype=float)
         match self.dither:
             case "none":
@@ -136,7 +139,10 @@ class Words(Module):
         return 1 - 2 * jnp.mod(jnp.floor(index[:, None] / powers), 2.0)
 
     def send(self, y: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the word of each component, and the numbers by which it is carried, (outputs * carried,)."""
+        """Return the word of each component, and the numbers by which the channel carries it, (outputs * carried,).
+
+        These are its bits as signs, and behind them its dither d where the receiver subtracts it.
+        """
         d = self.draw_dither(key, len(y))
         index = self.index(y + d)
         numbers = self.signs(index)
@@ -182,7 +188,7 @@ def _read_range_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def _checksum_node_name(node: str) -> int:
-    """Return the CRC-32 of a node's name."""
+    """Return the CRC-32 of a node's name, which seeds its dither alike on every machine."""
     from zlib import crc32
 
     return crc32(node.encode())

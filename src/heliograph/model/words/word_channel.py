@@ -42,13 +42,15 @@ class WordForm(NamedTuple):
 
 
 def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
-    """Return the channel of the numbers by which the words are carried: their bits, and dithers that pass.
+    """Return a channel of words as one of the numbers by which they are carried: their bits, and dithers that pass.
+
+    Losses, delays and choices act on all numbers of a word; only bits are flipped.
 
     Args:
         encoder: of the words.
         channel: of words.
     """
-    beside = encoder.carried - encoder.bits
+    beside = encoder.carried - encoder.bits  # numbers of a word beside its bits: its dither, if any
     eye = np.eye(encoder.carried)
     form = WordForm(
         flips=lambda link, places: link.on_bits(encoder.bits, beside),
@@ -60,7 +62,9 @@ def rewrite_in_bits(encoder: Words, channel: Channel) -> Channel:
 
 
 def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
-    """Return the channel of the words as numbers about the centres of their range.
+    """Return a channel of words as one of numbers: each word less the centre of its range.
+
+    Flipped bits are then a random gain and noise, which depend on the variance of a word, `power`.
 
     Args:
         encoder: of the words.
@@ -68,7 +72,7 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link of one step between words as numbers about their centres."""
+        """Return the link of one step, `power` being the variance of each word, all of its values equally likely."""
         power = encoder.each(encoder.power, signal_size(link))
         return rewrite_channel(
             link, WordForm(lambda flips, places: flips.about_centre(power[list(places)]), known, 1)
@@ -90,12 +94,12 @@ def make_word_reader(channel: Channel) -> WordReader:
 
 
 def rewrite_channel(channel: AbstractRandomAffine, form: WordForm) -> RewrittenMap:
-    """Return a channel of words written in another form, and the components of y at its outputs.
+    """Return a channel of words written in another form (as bits or numbers), and which component each output carries.
 
     Raises:
         ValueError: a channel that does more with words than select, copy, flip, delay and lose them.
     """
-    sent = tuple(range(signal_size(channel)))
+    sent = tuple(range(signal_size(channel)))  # repeated below for the earlier signals that a late channel takes
     return _rewrite_map(channel, sent * (1 + channel.past), form)
 
 
@@ -137,7 +141,10 @@ def _rewrite_map(link: AbstractRandomAffine, places: Places, form: WordForm) -> 
 
 
 def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a wire that selects components, rewritten; words pass no other gain."""
+    """Return a noiseless link that selects components, rewritten in `form`, with the component at each of its outputs.
+
+    `places`: the components of y that it is given. Words pass no other gain and no noise: raises ValueError.
+    """
     matrix, gain = np.asarray(link.matrix), link.law.constant
     is_noiseless = not np.any(np.asarray(link.noise.covariance)) and not np.any(np.asarray(link.noise.mean))
     selects_one_each = np.isin(matrix, (0, 1)).all() and (matrix.sum(axis=1) == 1).all()
@@ -147,7 +154,10 @@ def _rewrite_selection(link: GainAndNoise, places: Places, form: WordForm) -> Re
 
 
 def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMap:
-    """Return maps one after another, rewritten: each gets the components that the one before delivers."""
+    """Return maps one after another, rewritten in `form`: each gets the components that the one before delivers.
+
+    `places`: the components of y that the first is given.
+    """
     maps = []
     for part in link.maps:
         rewritten = _rewrite_map(part, places, form)
@@ -157,7 +167,10 @@ def _rewrite_series(link: Series, places: Places, form: WordForm) -> RewrittenMa
 
 
 def _rewrite_choice(link: AbstractOneOfSeveralMaps, places: Places, form: WordForm) -> RewrittenMap:
-    """Return a choice among several maps, rewritten; raise ValueError unless all deliver the same components."""
+    """Return a choice among several maps, rewritten in `form`; raise ValueError unless all deliver the same components.
+
+    `places`: the components of y that each is given.
+    """
     parts = [_rewrite_map(part, places, form) for part in link.maps]
     if len({part.places for part in parts}) > 1:
         raise fail("channel of words", "choices and modes that deliver the same components", "others")

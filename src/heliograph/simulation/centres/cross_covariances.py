@@ -68,11 +68,12 @@ class CrossCovariances:
         return np.asarray(self.state @ self.state.T)
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
-        """Return the best unbiased weights W and the covariance W P W' of their error.
+        """Return the best unbiased weights W of the nodes' estimates and the covariance W P W' of their weighted error.
 
         The time that it takes is linear in the number of nodes where P allows it.
         """
         weights = _choose_weights(self._error_sources)
+        # The error as factors of what the nodes share, and what is independent of it.
         shared, independent = self._error_sources.weigh(weights)
         return weights, np.asarray(shared @ shared.T + independent)
 
@@ -122,10 +123,10 @@ class CrossCovariances:
 
 
 def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
-    """Return the weights of least error variance for estimates with these errors.
+    """Return the weights (n, node, n) of least error variance for the nodes' estimates with these errors.
 
-    By factors where the errors' independent parts are regular enough, at a cost linear in the nodes; else by their
-    joint covariance.
+    By factors where the part of each error that is independent of all others is regular enough (REGULAR), at a cost
+    linear in the nodes; else by the joint covariance of all errors.
     """
     # Least eigenvalue of the independent parts, in units of each component's whole deviation.
     scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
@@ -173,7 +174,7 @@ def cross_covariances(
 def fused_covariances(
     network: Network, horizon: int, inputs: Float[ArrayLike, "horizon inputs"] | None = None
 ) -> dict[str, Float[np.ndarray, "time n n"]]:
-    """Return the covariances (time, n, n) of the network's informed fusions, by name, for complete data.
+    """Return the covariances (time, n, n) of the errors of the network's informed fusions, by name, for complete data.
 
     An informed fusion is one that knows how the errors of its estimates are correlated.
 
@@ -211,7 +212,7 @@ def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | No
 @quickly_compiled
 def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFactors:
     """Return the joint covariance of all errors by its factors, after the steps of u, for the one informed fusion."""
-    (centre,) = filters.linear_centres
+    (centre,) = filters.linear_centres  # that of the informed fusion, which knows how the errors are correlated
     filter_states, _, _, (centre_state,), *_ = filters.init()
     nodes, n = centre_state.errors.bias.shape
     # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
@@ -230,7 +231,10 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
     """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u."""
 
     def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices; means are 0."""
+        """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices.
+
+        Covariances do not depend on data, so means are taken as 0.
+        """
         (states, centre_states), (k, u_k) = carry, row
         covariances: dict[str, jax.Array] = {}
         following = []

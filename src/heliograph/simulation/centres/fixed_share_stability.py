@@ -21,7 +21,7 @@ def check_error_decay(
     what: str, graph: Graph, shares: np.ndarray, arrival: np.ndarray, plant: tuple[np.ndarray, np.ndarray],
     squares: np.ndarray,
 ) -> None:  # fmt: skip
-    """Raise ValueError for fixed shares with which the errors of a node grow.
+    """Raise ValueError for fixed shares, by which nodes weigh their neighbours' estimates, with which errors grow.
 
     Args:
         what: name of the fusion.
@@ -35,7 +35,7 @@ def check_error_decay(
         ValueError: errors that grow, by the name of the node where they are largest.
     """
     arrives = np.zeros(graph.present.shape)
-    arrives[:, 1:][graph.present[:, 1:]] = arrival
+    arrives[:, 1:][graph.present[:, 1:]] = arrival  # place 0 of each node is the node itself
     growth, sizes = _compute_growth_and_sizes(graph, arrives, _make_error_maps(graph, shares, plant, squares))
     if growth > 1 + SLOW:
         raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
@@ -105,7 +105,7 @@ def _compute_growth_and_sizes(graph: Graph, arrives: np.ndarray, maps: _ErrorMap
 
 
 def _take_moments_of_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:
-    """Return E[(e_i, e_j) (e_i, e_j)'] of each node i and each sender j that it receives, (node, degree, 2 n, 2 n).
+    """Return E[(e_i, e_j) (e_i, e_j)'] of the errors of node i and each sender j it receives, (node, degree, 2 n, 2 n).
 
     `blocks`: E[e_i e_j'] of all nodes (node, n, node, n).
     """

@@ -99,7 +99,10 @@ class FusedInnovation(Module):
 def _predict_by_first(
     filters: AbstractFilter, states: PyTree, estimate: Gaussian, u: jax.Array, k: jax.Array
 ) -> Gaussian:
-    """Return `estimate` predicted over step k by the first of some stacked filters."""
+    """Return `estimate` predicted over step k by the first of some stacked filters, all of one plant.
+
+    `states`: of the filters, stacked too: the first one's takes the estimate in place of its own.
+    """
     numbers, static = eqx.partition(filters, eqx.is_array)
     head, state = jax.tree.map(lambda leaf: leaf[0], (numbers, states))
     first: AbstractFilter = eqx.combine(head, static)
@@ -128,7 +131,10 @@ def _correct_in_turn(
     numbers, static = eqx.partition(filters, eqx.is_array)
 
     def correct(before: _CorrectedEstimate, row: tuple[PyTree, PyTree, jax.Array]) -> tuple[_CorrectedEstimate, None]:
-        """Correct x by one node's filter, and add its squared innovation."""
+        """Return the fused estimate x corrected by one node's filter, with its squared innovation e' S^-1 e added.
+
+        `row`: the filter's arrays (`static` is the rest of it), its predicted state, and the node's measurement.
+        """
         node_numbers, prior, z = row
         after, innovation = eqx.combine(node_numbers, static).correct(with_gaussian(prior, before.x), z, k)
         distance, arrived = innovation_distance(innovation)

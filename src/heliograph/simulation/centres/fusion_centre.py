@@ -76,15 +76,18 @@ class FusionCentre(Module):
     compute_matrices = staticmethod(linear_step)
 
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
-        """Return the state before the first step, from the initial means (node, n) of each source's filters."""
+        """Return the centre's state before the first step: moments of all nodes' errors, and the rules' states.
+
+        `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
+        """
         plant = at(self.plant, 0)
         errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
     def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
-        """Return the step of the errors of filters with these matrices, and the errors' moments after it.
+        """Return the linear maps by which the nodes' errors move in step k, and the errors' moments after it.
 
-        `errors`: moments before step k. `filters`: matrices in the order of the nodes.
+        `errors`: moments before step k. `filters`: matrices of the nodes' filters, in the order of the nodes.
         """
         step = self.compute_error_maps(errors.state_mean, errors.state_covariance, filters, u, k)
         return CentreStep(step, propagate_errors_jointly(errors, step))
@@ -97,6 +100,7 @@ class FusionCentre(Module):
         `mean` (n,) and `covariance` (n, n): of the plant's state. `filters`: matrices in the order of the nodes.
         """
         plant: LinearPlant = at(self.plant, k)
+        # x+ = A x + shift + w; what is measured of the state after the step depends on its moments there.
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
         observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
         return make_error_step(filters, motion, observation)
@@ -120,7 +124,7 @@ class FusionCentre(Module):
         def propagate(
             carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
-            """Step the filters' states, and the factors by the filters' matrices."""
+            """Step the filters' states over step k, and the factors of the errors' covariance by their matrices."""
             (states, factors), (k, u_k) = carry, row
             # Moments of the plant's state: row 0 of the means, and its part of the factors.
             covariance = jnp.asarray(factors.state @ factors.state.T)
@@ -150,7 +154,7 @@ class FusionCentre(Module):
             u: inputs of the plant over the step.
             k: number of the step.
         """
-        happened = self.step_errors(state.errors, self.gather_matrices(parts), u, k)
+        happened = self.step_errors(state.errors, self.gather_matrices(parts), u, k)  # what the errors went through
         reports = jnp.concatenate(means)[self.order]
         after, results = {}, {}
         for name, rule in self.rules.items():
@@ -171,7 +175,10 @@ def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) 
     """
 
     def pad(name: str, leaf: jax.Array) -> jax.Array:
-        """Return the matrix that is the field `name`, with its measurement axes padded to `size`."""
+        """Return the matrix that is the field `name`, with its measurement axes padded to `size`.
+
+        MEASURED: by field the axes, counted from the last, that are as long as a measurement.
+        """
         padding = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
                    for axis, length in enumerate(leaf.shape)]  # fmt: skip
         return jnp.pad(leaf, padding)
@@ -187,7 +194,9 @@ Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # sensor, chann
 
 
 def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
-    """Return the claim of fusion by an informed rule: "exact", "upper" where noise is known by bounds, else "nominal".
+    """Return the claim of fusion by a rule that knows how errors are correlated: "exact", "upper" or "nominal".
+
+    "upper" where noise is known by bounds; "nominal" where probabilities are uncertain or gains depend on data.
 
     Args:
         rule: its name, for errors.
@@ -240,7 +249,9 @@ def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
 
 
 def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
-    """Return the claim of fusion by reports: that of the fusion, lowered by quantizers and uplinks of uncertain laws.
+    """Return the claim of fusion by reports, which nodes send to a centre: `claim`, lowered by what is uncertain.
+
+    That is quantizers of the reports, and uplinks, the nodes' channels to the centre, with uncertain probabilities.
 
     `complete`: for each node whether it loses no measurement.
 
@@ -259,7 +270,10 @@ def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complet
 
 
 def _has_uncertain_law(channel: Channel) -> bool:
-    """Return whether probabilities of the channel's laws are known up to a radius only."""
+    """Return whether probabilities of the channel's laws are known up to a radius only.
+
+    Each extreme law that they allow is a corner.
+    """
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))
     except ValueError:  # too many corners to list
@@ -320,7 +334,7 @@ class CentreFilter(AbstractSizedFilter):
 
     @compile_in_float64
     def init(self) -> CentreFilterState:
-        """Return the state before any report."""
+        """Return the state before any report: nodes' filters, moments of their errors, and what the centre believes."""
         states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
         return CentreFilterState(
@@ -329,7 +343,10 @@ class CentreFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: CentreFilterState, u: ArrayLike = (), k: Step = 0) -> CentreFilterState:
-        """Predict plant and all errors; the nodes send their reports."""
+        """Return the state after the nodes filtered step k and sent their reports: plant and all errors are predicted.
+
+        The nodes' gains depend on no data, so that the centre computes them itself.
+        """
         (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
         happened = centre.step_errors(state.errors, filters, u, step)
@@ -338,7 +355,11 @@ class CentreFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: CentreFilterState, z: ArrayLike, k: Step = 0) -> tuple[CentreFilterState, Innovation]:
-        """Correct with the reports that arrived, z of `rows`, NaN where one did not; return the innovation too."""
+        """Return the state corrected by the reports that arrived, and their innovation; z is NaN where one did not.
+
+        `rows`: places of z among all numbers that could come, (age, node, widest): of every delay, padded to the
+        longest report.
+        """
         nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
         reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
         known, expected = correct_with_reports(state.known, reports.reshape(self.ages, nodes, self.widest))

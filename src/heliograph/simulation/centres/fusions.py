@@ -63,7 +63,10 @@ class StackedFusions(Module):
     angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
-        """Return the quantizers' states before the first step, for a plant of n states; () without quantizers."""
+        """Return the states of the quantizers, by which nodes send estimates in few bits, before the first step.
+
+        () without quantizers; else of each fusion and node, (fusion, node, ...). `n`: number of the plant's states.
+        """
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
@@ -108,7 +111,10 @@ class StackedFusions(Module):
         return states, fused, uplinks
 
     def _gather_by_fusion(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
-        """Return values of the filters, (filter, node, ...) by kind, as (fusion, node, ...) in each fusion's order."""
+        """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
+
+        `parts`: (filter, node, ...) by kind of filter; `sources`: for each fusion the (kind, filter) that it fuses.
+        """
         joined = [jnp.concatenate([parts[kind][f] for kind, f in source]) for source in self.sources]
         # In order already: no gather is compiled.
         if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
@@ -230,9 +236,9 @@ def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingN
 
 
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
-    """Return the network's fusions of estimates by rules that know nothing of the nodes; of one structure, stacked.
+    """Return the network's fusions of estimates by rules that need no model of the nodes; of one structure, stacked.
 
-    Informed rules have centres instead (`list_centres`).
+    Rules that know how the nodes' errors are correlated, called informed, have centres instead (`list_centres`).
     """
     names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
@@ -314,9 +320,10 @@ def _build_centre(
 def find_source_filters(
     network: Network, places: Mapping[tuple[str, str], EstimatePlace], nodes: Sequence[str], name: str
 ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-    """Return where the filters of this name stand in the stacks: (kind, number within the kind), and an order.
+    """Return where the filters of this name stand in the stacks of filters: (kind, number within the kind); an order.
 
-    The estimates of these sources (node, n), one source after another and indexed by the order, are those of `nodes`.
+    A kind is a stack of filters of one structure, over a group of nodes. The estimates (node, n) of these sources, one
+    source after another and indexed by the order, are those of `nodes`.
 
     Args:
         network: the network.

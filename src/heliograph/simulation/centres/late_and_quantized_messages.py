@@ -60,6 +60,7 @@ def find_event_senders(
     lost before: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
     """
     far = jnp.einsum("ida,idab,idb->id", off, information, off) > alpha * off.shape[-1]
+    # A node sends if it is far from what any neighbour received last; place 0 is the node itself.
     far_for_neighbours = (far & present)[:, 1:]
     receivers = jnp.zeros(len(off), dtype=int).at[senders[:, 1:]].add(far_for_neighbours.astype(int))
     return receivers > 0
@@ -70,7 +71,7 @@ def quantize_estimate(
 ) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return what a node sends of an estimate: the mean quantized, NaN if it saturates, and a covariance wider by that.
 
-    Without state, as a quantizer between neighbours has none.
+    The quantizer's state is (), as one between neighbours has none.
     """
     value = quantizer.step((), mean)[1]
     received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)

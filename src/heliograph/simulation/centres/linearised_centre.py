@@ -59,7 +59,7 @@ class LinearisedCentre(Module):
     def init(self, starts: Sequence[jax.Array]) -> dict[str, LinearisedFusionState]:
         """Return the states of all fusions before the first step, by name.
 
-        `starts`: initial means (node, n) of each source's filters.
+        `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
         """
         plant = at(self.plant, 0)
         errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
@@ -110,7 +110,8 @@ class LinearisedCentre(Module):
 def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: LinearisedStep) -> ErrorStep:
     """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
 
-    The state x itself stands first. Errors do not depend on x, and those of mean zero keep it.
+    A, w: of the plant's `motion`; K_i, nu_i: gain and measurement noise of node i (`linear`). The state x itself stands
+    before the errors, which do not depend on it; only x is shifted, so that errors of mean zero keep that mean.
     """
     nodes, n, _ = keep.shape
     return ErrorStep(
@@ -124,9 +125,10 @@ def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: LinearisedSt
 
 
 def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMoments:
-    """Return the moments of the errors `after` a step with those of the plant `before` it.
+    """Return the moments of the errors `after` a step, but those of the plant's state as `before` it.
 
-    Along estimates nobody knows the plant's own moments: its mean stays, and its covariance with all else.
+    Models are linearised along estimates here, so that nobody knows the plant's own moments: its mean stays, and its
+    covariance with all else. Row 0 of the means, and the first n numbers of the covariance, are the plant's.
     """
     n = before.mean.shape[1]
     of_errors = np.arange(len(before.covariance)) >= n

@@ -82,7 +82,7 @@ class Mesh(Module):
 
     @property
     def has_long_step(self) -> bool:
-        """Return whether a step has too many operations for native code, in which they are written one by one."""
+        """Return whether a step has more operations than MESH: too many for native code, which writes out each one."""
         n = len(first(self.plant).states)
         # About n^2 operations for each message, and N^2 twice for a joint covariance of N = nodes n numbers.
         for_messages = self.edges.rounds * int(np.count_nonzero(self.edges.present)) * n * n
@@ -178,7 +178,7 @@ class Mesh(Module):
         """Return s - S xb of each node, xb its `predicted` estimate (node, n): what the measurements say beyond it.
 
         Computed as sum_j H_j' R_j^-1 (z_j - offset_j - H_j m) - S (xb - m), `weighted` the terms of the sum, about one
-        m for all nodes, `common`: so no digits of large means are lost.
+        m for all nodes, `common`: so no digits of large means are lost. S is `step.information`.
         """
         sums = self._sum_over_reached_nodes(weighted, arrived)
         return sums - jnp.einsum("iab,ib->ia", step.information, predicted - common)
@@ -190,7 +190,7 @@ class Mesh(Module):
         """
         if state.way is None:
             return None
-        ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)
+        ages = arrived if self.edges.past else jnp.where(arrived, 0, -1)  # 0: at once, -1: not at all
         return gather_messages(state.mean, state.covariance, state.way, self.quantizer, self.senders, ages)
 
     def _select_received_estimates(
@@ -315,7 +315,7 @@ class Mesh(Module):
 
     def _sum_over_reached_nodes(self, values: jax.Array, arrived: Arrived) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of all nodes that reach it in any round, each once."""
-        if self.edges.rounds == 1:
+        if self.edges.rounds == 1:  # from the senders to the node alone
             return self.sum_over_messages(values, jnp.asarray(arrived[:, 0]))
         return jnp.tensordot(self.find_known_measurements(arrived).astype(values.dtype), values, 1)
 
@@ -330,7 +330,7 @@ class Mesh(Module):
     def sum_over_messages(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of the senders whose messages it has.
 
-        `present` (node, degree): which these are.
+        `present` (node, degree): which these are, of `senders`, the nodes that it receives.
         """
         sums: jax.Array = jnp.einsum("id,id...->i...", present.astype(values.dtype), values[self.senders])
         return sums
@@ -359,7 +359,7 @@ class Mesh(Module):
             complete: jax.Array,
             weights_ahead: Sequence[jax.Array],
         ) -> NodeGains:
-            """Return the gains of one node, with weights computed ahead or those of the rule."""
+            """Return the gains of one node, with weights computed ahead or those of the rule for what it received."""
             step = NodeStep(motion.matrix, motion.noise, arrived=information, complete=complete)
             if weights_ahead:
                 # Weights C_j = front parts_j with front = I.
@@ -374,14 +374,17 @@ class Mesh(Module):
     def compute_weights_ahead(self, arrived: Bool[np.ndarray, "step node rounds degree"]) -> Ahead:
         """Return the weights of many steps by bucket, with a leading axis of steps, from what arrives at each.
 
-        Empty where they depend on more than that: on covariances before the step.
+        Empty where they depend on more than that: on covariances before the step. Buckets: nodes of like degree.
         """
         weights = [bucket.rule.weights_ahead(arrived[:, bucket.rows, -1, : bucket.width])
                  for bucket in self.buckets if isinstance(bucket.rule, FrozenWeights)]  # fmt: skip
         return () if None in weights else tuple(filter(None, weights))
 
     def _split_by_group(self, mean: jax.Array, covariance: jax.Array) -> tuple[Estimate, ...]:
-        """Return the estimates (1, node, ...) by group of nodes, from `mean` and `covariance` in the mesh's order."""
+        """Return the estimates (1, node, ...) by group of nodes, from `mean` and `covariance` in the mesh's order.
+
+        `places`: for each group the numbers of its nodes in the mesh. The axis of 1: of filters, here the fusion alone.
+        """
         return tuple(
             Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
         )

@@ -51,7 +51,10 @@ def build_mesh(network: Network, name: str) -> Mesh:
 
 
 def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObservations:
-    """Return the measurement models of these nodes of a network, in their order; those without a sensor have none."""
+    """Return the measurement models of these nodes of a network, in their order; without a sensor they measure nothing.
+
+    Nodes of one group of the network have models of one structure, which are stacked.
+    """
     groups: list[ObservationModel | None] = []
     places: dict[str, int] = {}  # of each node among all, group after group
     for names in network.groups:
@@ -72,6 +75,7 @@ def build_meshes(network: Network) -> dict[str, Mesh]:
     Raises:
         ValueError: too many nodes for a rule that follows the joint covariance of their errors.
     """
+    # DENSE: the most nodes whose joint covariance is propagated.
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         if fusion.rule.needs_joint and nodes > DENSE:

@@ -232,7 +232,7 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
 
 
 def _measures_mode(node: object, vector: np.ndarray) -> bool:
-    """Return whether a node's own measurement shows the mode of this eigenvector."""
+    """Return whether a node's own measurement shows the plant's mode of this eigenvector: H v is not 0, to RANK."""
     if not isinstance(node, Node):
         return False
     return bool(np.any(np.abs(_scale_rows(_get_gain_and_noise(node)[0]) @ vector) > RANK))
@@ -241,8 +241,8 @@ def _measures_mode(node: object, vector: np.ndarray) -> bool:
 def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tuple[list[str], list[str]]:
     """Return the nodes for which nobody upstream observes some unstable mode of A, and those for some decaying mode.
 
-    `squares`: H'H of each node (node, n, n). Nodes that reach each other have the same nodes upstream, in one array
-    `places`, which is checked once.
+    Upstream of a node are itself and all whose messages can reach it. `squares`: H'H of each node (node, n, n). Nodes
+    that reach each other have the same nodes upstream, in one array `places`, which is checked once.
     """
     without_unstable, without_decaying = [], []
     values = np.linalg.eigvals(a)
@@ -261,7 +261,8 @@ def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tu
 def _hides_modes(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> tuple[bool, bool]:
     """Return whether outputs hide a mode of A that does not decay, and whether they hide one that does.
 
-    `values`: eigenvalues of A. `square`: sum of H'H over the outputs' gains, which hides what all of them hide.
+    `values`: eigenvalues of A; from 1 - MODE on one does not decay. `square`: sum of H'H over the outputs' gains, which
+    hides what all of them hide. RANK: the singular value below which one counts as 0.
     """
     size = np.linalg.norm(a, 2) or 1.0
     hides_unstable = hides_decaying = False
@@ -284,6 +285,7 @@ def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
     """Return H, the mean matrix from state to what a node receives, and R, its noise's covariance at zero signal."""
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
+    # The channel's noise: the last entry of the covariance of gains and offset, which a signal of 0 leaves.
     gain = np.asarray(channel.mean_gain)
     noise = gain @ np.asarray(sensor.noise.covariance) @ gain.T + np.asarray(channel.nominal.center)[:, :, -1, -1]
     return gain @ np.asarray(sensor.matrix), noise
@@ -292,7 +294,7 @@ def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
 def _check_noise_is_regular(where: str, noise: np.ndarray) -> None:
     """Raise ValueError for a measurement without noise in some direction: its information is infinite.
 
-    `where`: the node, for errors. `noise`: R.
+    `where`: the node, for errors. `noise`: the covariance R, judged as correlations; RANK: what counts as 0 of these.
     """
     scale = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
     if np.any(scale == 0) or np.linalg.eigvalsh(noise / np.outer(scale, scale))[0] < RANK:
@@ -326,7 +328,10 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
 
 
 def _measures_alike_at_each_step(node: Node) -> bool:
-    """Return whether a node's measurement is the same at every step, and no signal adds to its noise."""
+    """Return whether a node's measurement has one law at every step, and its noise does not grow with the signal.
+
+    It would if the channel's gains were random: if the covariance of gains and offset were not 0 in the gains' part.
+    """
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
     return not np.any(np.asarray(second_order(node.channel.condition_on_arrival()).nominal.center)[:, :, :-1, :-1])

@@ -88,7 +88,7 @@ def mesh_arrivals(network: Network, fusion: str, horizon: int, key: int | jax.Ar
 
 @quickly_compiled
 def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.Array:
-    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: all rules share a program."""
+    """Draw what arrives at these steps (step, node, rounds, degree), by the edges alone: one program for all rules."""
 
     def draw_step(state: tuple[PyTree, ...], k: jax.Array) -> tuple[tuple[PyTree, ...], jax.Array]:
         """Draw what arrives at step k: next states of the channels, and flags (node, rounds, degree)."""
@@ -180,7 +180,7 @@ def _compute_step_when_all_is_measured(
     mesh: Mesh, covariance: np.ndarray, blocks: np.ndarray | None, moments: PyTree, arrived: np.ndarray,
     u: np.ndarray, k: np.ndarray,
 ) -> MeshStep:  # fmt: skip
-    """Return step k without the estimates, with all components measured.
+    """Return all of step k that does not depend on the estimates, such as gains, with all components measured.
 
     Arguments as of `Mesh.compute_step_without_estimates`.
     """
@@ -260,7 +260,8 @@ def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshSt
     `flags`: what arrives (step, node, rounds, degree). `steps`: with the information in each node's measurements.
     """
     count = len(mesh.nodes)
-    # From the last step back: the more exchanges follow, the more nodes' measurements can have come.
+    # From the last step back: the more exchanges follow, the more nodes' measurements can have come. `known`: sparse
+    # (node, node), a one where the data of the column's node reach the row's.
     known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
@@ -280,7 +281,7 @@ def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np
     lossless = mesh.edges.lossless()
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
-    if mesh.needs_joint:
+    if mesh.needs_joint:  # any blocks do, since they matter to gains alone
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
     return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, lossless, u, k)
@@ -295,7 +296,7 @@ def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     receiver, column = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
     step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
-    reached = known @ step
+    reached = known @ step  # step: a one where the row's node receives the column's
     reached.data = np.minimum(reached.data, 1)
     return reached
 
@@ -343,9 +344,9 @@ def freeze(
 
 
 def find_mesh(network: Network, fusion: str) -> Mesh:
-    """Return the fusion of this name between neighbours, ready to be stepped; raise where there is none.
+    """Return the fusion of this name between neighbours, ready to be stepped; raise ValueError where there is none.
 
-    Also raises for one of over 2,000 nodes (SPARSE).
+    It raises also for one of over 2,000 nodes (SPARSE), whose joint covariance would not fit in memory.
     """
     instance("network", network, Network, "a Network")
     if not isinstance(fusion, str) or fusion not in network.meshes:
@@ -370,5 +371,5 @@ def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node r
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    arrives: np.ndarray = flags & mesh.edges.present[:, None]
+    arrives: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
     return arrives

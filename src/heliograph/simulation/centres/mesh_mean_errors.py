@@ -118,7 +118,7 @@ def mean_mesh_errors(
 
 
 def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
-    """Return all patterns of what may arrive in a step of this fusion, and the mesh with a row for each of them."""
+    """Return all patterns of which messages may reach a node in a step, and the mesh with a row for each of them."""
     graph = graph_of(fusion.neighbours or {}, mesh.nodes)
     links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
@@ -129,7 +129,7 @@ def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
 def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: ArrivalPatterns) -> Mesh:
     """Return the mesh with a row for each pattern of each node in place of one for each node.
 
-    `rule`: placed on the nodes, which are the last axis of its arrays.
+    A pattern: which messages reach the node. `rule`: placed on the nodes, which are the last axis of its arrays.
     """
     rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
     bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
@@ -146,7 +146,7 @@ def _compute_gains_by_pattern(
     Args:
         rows: the mesh, with a row for each pattern.
         covariance: by which the nodes' estimates are weighed before the step (node, n, n).
-        blocks: of J at each neighbourhood (node, degree, n, degree, n).
+        blocks: of J, the joint covariance of all errors, at each node's neighbours (node, degree, n, degree, n).
         patterns: what arrives.
         step: at which everything arrives, for the models and the measurements' information.
     """
@@ -226,7 +226,7 @@ def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPa
 
 
 def _get_known_probability(edge: str, link: Channel) -> float:
-    """Return the probability that a message of this edge arrives, at every step the same and drawn anew."""
+    """Return the probability that a message of this edge arrives; raise unless losses are independent over steps."""
     chance = find_arrival_probability(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"

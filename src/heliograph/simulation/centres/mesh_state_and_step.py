@@ -104,7 +104,10 @@ class MeshStep(NamedTuple):
 
 
 def compute_information(observation: JointObservation, measured: Bool[jax.Array, "node m"]) -> MeasurementInformation:
-    """Return the information in each node's measurement: in the components measured, and as if none were missing."""
+    """Return the information H' R^-1 H in each node's measurement: in what was measured, and as if nothing was missing.
+
+    `observation`: gain H and noise covariance R of each node; `measured`: which components came.
+    """
     # Rows of zeros without noise only pad a measurement.
     real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
     gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
@@ -119,10 +122,13 @@ def weigh_measurements(
     present: Bool[jax.Array, "node m"],
     common: Float[jax.Array, " n"],
 ) -> Float[jax.Array, "node n"]:
-    """Return H_j' R_j^-1 (z_j - offset_j - H_j m) of each node's measurement, m = `common`; what is missing adds 0."""
+    """Return H_j' R_j^-1 (z_j - offset_j - H_j m) of each node's measurement z_j, m = `common`; what is missing adds 0.
+
+    H_j, R_j: gain and noise covariance of node j; `present`: which components of z_j came.
+    """
     observation = data.observation
     off = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
-    return jnp.einsum("inm,im->in", data.weighted, off)
+    return jnp.einsum("inm,im->in", data.weighted, off)  # weighted: H_j' R_j^-1
 
 
 def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEstimates:

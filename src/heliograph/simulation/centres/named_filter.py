@@ -66,6 +66,7 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
     fused = network.fused[name]
     if isinstance(fused, AbstractFilter):
         names = [f"{node}_{part}" for node in network.names for part in network.nodes[node].received_names]
+        # A central filter receives the numbers of all nodes, or none at all.
         return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
     if not fused.rule.uses_reports:
         rule = type(fused.rule).__name__
@@ -81,7 +82,7 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
     uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
     for age in range(uplinks.delay.shape[1]):
-        late = f"_{age}_late" if age else ""
+        late = f"_{age}_late" if age else ""  # age: steps between sending and arrival
         for node, link, size in zip(nodes, fusion.links(nodes), uplinks.received, strict=True):
             parts = network.states if link.channel is None else [f"report{i}" for i in range(size)]
             names += [f"{node}_{part}{late}" for part in parts]

@@ -54,10 +54,13 @@ class MeshEdges(Module):
     past: int = eqx.field(static=True, default=0)
 
     def init(self, key: jax.Array) -> tuple[PyTree, ...]:
-        """Return the states of the channels before the first step of the run with this key, one for each group."""
+        """Return the states of the edges' channels before the first step of the run with this key.
+
+        One for each group, a stack of channels of one structure.
+        """
 
         def start_group(group: ChannelGroup) -> PyTree:
-            """Return the initial state of one channel of a stack."""
+            """Return the initial state of one channel of a stack, drawn by the run's key."""
             return start_channel(group.channel, key, group.checksums, group.memories)
 
         return tuple(eqx.filter_vmap(start_group, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
@@ -96,7 +99,11 @@ class MeshEdges(Module):
         """
 
         def deliver_once(edge: ChannelGroup, state: PyTree, count: jax.Array) -> tuple[PyTree, jax.Array]:
-            """Send a message over one edge: the channel's next state, and the flag or age of what arrives."""
+            """Return the next state of one edge's channel, and what arrives of a message sent over it at step k.
+
+            A flag, or its age in steps (-1: nothing) where messages may be late. `count`: number of the exchange, by
+            which with `key` it is drawn.
+            """
             # What is sent does not matter: lost numbers are NaN, and a time stamp is the last number.
             channel = at(edge.channel, k)
             state, z = deliver_signal(channel, state, jnp.zeros(signal_size(channel)), key, count,
@@ -157,9 +164,9 @@ class MeshEdges(Module):
     def _read_ages(
         self, node: str, report: SentReports | ArrayLike, steps: int, neighbours: int
     ) -> Int[np.ndarray, "steps rounds neighbours"]:
-        """Return the ages of what a node received, -1 where nothing arrived, from its report; raise where one is none.
+        """Return the ages in steps of the messages that a node received, -1 where none arrived, from its report.
 
-        `neighbours`: how many this node has.
+        Raises ValueError for an age above `past`, the most by which a message may be late. `neighbours`: of this node.
         """
         recorded = report.values if isinstance(report, SentReports) else report
         values = array(f"reports of node {node!r}", recorded, (steps, self.rounds * neighbours), missing=True)
@@ -182,13 +189,14 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
     # One channel under many names is checked once.
     for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
+    # Places of the edges in the flattened (node, degree), without place 0, the node itself.
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
     past = max(first(channel).past for channel in links.values())
     return MeshEdges(group_channels(links), slots, graph.present, fusion.rounds, past)
 
 
 def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[str, Channel]:
-    """Return the link of each edge by its name "SENDER to RECEIVER", receiver after receiver.
+    """Return the link of each edge, a pair of neighbours, by its name "SENDER to RECEIVER", receiver after receiver.
 
     `link`: one for all edges, or a link for each by this name.
     """
@@ -224,7 +232,7 @@ def find_delay(channel: AbstractRandomAffine) -> DelayedLink | None:
 def _split_losses_from_link(
     channel: AbstractRandomAffine, kinds: type | UnionType = Erasure
 ) -> tuple[Scalar, AbstractRandomAffine]:
-    """Return the probability that a message passes all outer maps of these kinds, and the map inside them."""
+    """Return the probability that a message passes all outer maps of these kinds (losses), and the map inside them."""
     arrival: Scalar = 1.0
     while isinstance(channel, kinds):
         arrival = arrival * plain(channel.arrival) if isinstance(channel, Erasure) else arrival
@@ -233,7 +241,10 @@ def _split_losses_from_link(
 
 
 def find_arrival_probability(channel: Channel | None) -> float | None:
-    """Return the probability that a message arrives; None where it differs between steps or depends on earlier ones."""
+    """Return the probability that a message arrives: 1 without a channel (None).
+
+    None where it differs between steps, or depends on earlier ones: the channel then erases inside, by its modes.
+    """
     if channel is None or isinstance(channel, OverTime):
         return 1.0 if channel is None else None
     chance, inside = _split_losses_from_link(channel)
@@ -259,7 +270,7 @@ def find_loss_decay(channel: Channel | None) -> float | None:
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
-    """Return whether a channel delivers exactly what is sent."""
+    """Return whether a channel delivers exactly what is sent: a gain of I, without offset, noise or random gains."""
     if channel.inputs != channel.outputs:
         return False
     moments = second_order(channel.condition_on_arrival())

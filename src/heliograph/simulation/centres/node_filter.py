@@ -72,6 +72,7 @@ class NodeFilter(AbstractSizedFilter):
         """Return the state before the first step: the plant's initial law, and no message on the way."""
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
+        # The state of a mesh of the node and its neighbours; the first axis of `way`, ages, is empty.
         alone = start._replace(way=MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
         return NodeState(alone, jnp.zeros(len(self.inputs)), alone)
 
@@ -114,8 +115,8 @@ class NodeFilter(AbstractSizedFilter):
     def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
 
-        Rows of these: the node's own, then its neighbours'. Where no message came, the mean is NaN, and the covariance
-        any regular one: the node's own.
+        Rows of these: the node's own, then its neighbours'. `measured`: how many numbers each measures. Where no
+        message came, the mean is NaN, and the covariance any regular one: the node's own.
         """
         n, begin = len(self.states), self.measured[0]  # where the next neighbour's numbers begin in z
         sensed, means, covariances = [z[:begin]], [before.mean[0]], [before.covariance[0]]
@@ -220,7 +221,7 @@ def _check_can_filter_alone(what: str, network: Network, between: Fusion) -> Non
                    type(between.rule).__name__)  # fmt: skip
     if between.rounds > 1 or between.alpha is not None:
         raise fail(what, "one exchange a step", "several rounds" if between.rounds > 1 else "events")
-    if "dt" in network.inputs:
+    if "dt" in network.inputs:  # the length of a step: nodes need not have the same steps then
         raise fail(what, "a plant whose time counts steps, which all nodes share", "the input 'dt'")
 
 

@@ -56,6 +56,7 @@ def _linearise_observation(
     """
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean  # E y, y = C x + v
+    # E (y, 1)(y, 1)', of which the random gains and the channel's noise make noise of z.
     second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.evaluate_center(second, jnp.ones(len(gain), dtype=bool))
@@ -80,7 +81,11 @@ class SeparateObservations(Module):
     counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
-        """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments."""
+        """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments.
+
+        `groups`: the models of one structure, stacked; None of nodes without a sensor, whose models are zeros. `size`:
+        of the longest measurement, to which all are padded.
+        """
         m, n = self.size, len(mean)
         parts = []
         for i, group in enumerate(self.groups):
@@ -103,7 +108,11 @@ class SharedObservation(Module):
     rows: np.ndarray
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
-        """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size)."""
+        """Return gain (node, size, n) and offset of each node, and the noise's covariance (node, size, node, size).
+
+        `mean`, `covariance`: of the plant's state. `rows`: of each node, its rows of what the one channel of all
+        delivers, -1 where a shorter measurement is padded.
+        """
         gain, offset, noise = _linearise_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         # A last row of zeros, which index -1 takes.
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))

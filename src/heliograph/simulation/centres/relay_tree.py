@@ -65,11 +65,11 @@ class RelayTree:
         Raises:
             ValueError: another number of estimates than of leaves; leading axes are free.
         """
-        nodes, n, _ = self.covariances[0].shape
+        nodes, n, _ = self.covariances[0].shape  # of the lowest level, the leaves
         values = np.asarray(estimates, dtype=float)
         if values.shape[-2:] != (nodes, n):
             raise fail("estimates of the leaves", f"shape (..., {nodes}, {n})", f"shape {values.shape}")
-        for weights in self.weights:
+        for weights in self.weights:  # (relay, n, child, n), level after level up to the root
             lacking = len(weights) * self.degree - values.shape[-2]
             filled = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, lacking), (0, 0)])
             apart = filled.reshape(*filled.shape[:-2], len(weights), self.degree, n)
@@ -220,7 +220,10 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
 
 
 def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
-    """Return the weights (relay, n, child, n) and the errors of the relays above nodes with these errors."""
+    """Return the weights (relay, n, child, n) and the errors of the relays that fuse nodes with these errors.
+
+    Each relay fuses the next `degree` nodes, its children; the last may have fewer, whose weights are padded.
+    """
     groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
     weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
@@ -234,7 +237,10 @@ def _fuse_at_relay(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
 
 
 def _weigh_children(children: ErrorSources) -> tuple[jax.Array, ErrorSources]:
-    """Return the best weights (n, child, n) of children with these errors, and the error of their weighted estimate."""
+    """Return the best weights (n, child, n) of the estimates of a relay's children, and the error of the weighted one.
+
+    `children`: their errors, as sources that they share and independent parts.
+    """
     children = ErrorSources(*map(jnp.asarray, children))
     weights = matrix_weights(children.joint())
     return weights, ErrorSources(*children.weigh(weights))

@@ -93,7 +93,7 @@ class Uplinks(Module):
         return np.flatnonzero(np.broadcast_to(exists, (self.delay.shape[1], *exists.shape)))
 
     def init(self) -> ReportsInTransit:
-        """Return the state with no report in transit."""
+        """Return the state with no report in transit from the nodes to the centre."""
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
         begin_all = eqx.filter_vmap(
@@ -163,7 +163,10 @@ class Uplinks(Module):
         return UplinkDraws(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _check_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
-        """Return the delays of a node's reports (steps,); raise at one that its uplink does not have."""
+        """Return the delays in steps of a node's reports (steps,); raise at one that its uplink to the centre lacks.
+
+        `delay` (node, steps): probability of each delay.
+        """
         delays: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
         if not np.all(np.isin(delays, possible)):
@@ -221,7 +224,7 @@ class Uplinks(Module):
 
 
 def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draw the matrices (channel, m + 1, n + 1) of a group's channels at step k, and the delays of what they carry.
+    """Draw the matrices [G n; 0 1] (channel, m + 1, n + 1) of a group's channels at step k, and delays in steps.
 
     `delay` (channel, ages): probability of each delay in steps.
     """

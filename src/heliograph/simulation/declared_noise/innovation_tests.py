@@ -89,7 +89,7 @@ def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[
         exact: whether innovations are independent if their claim is true.
     """
     rows, count = len(white), int(np.sum(~np.isnan(white)))
-    lags = min(LAGS, rows // 10)
+    lags = min(LAGS, rows // 10)  # LAGS: 10
     power = np.nansum(white**2)
     products = [white[lag:] * white[:-lag] for lag in range(1, lags + 1)]
     r = np.array([np.nansum(product) for product in products]) / power

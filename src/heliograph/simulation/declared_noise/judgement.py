@@ -368,7 +368,7 @@ def _make_judgement(
 
 
 def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
-    """Return lines on how large a bias is, how long it lasts in this unit of time, and what to do."""
+    """Return lines on how large a bias is, if it matters (LEAST: 1.1), its memory in this unit, and what to do."""
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
         bounded = bias.times_white < 2 * bias.times_white_low
@@ -383,7 +383,7 @@ def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
 
 
 def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
-    """Return a line on how much too large or small a class's variances are, if any; it is named if `several` are."""
+    """Return a line on how much too large or small the variances of a class of messages are; none if they are right."""
     if np.isnan(one.scale) or (one.scale_low < LEAST and one.scale_high > 1 / LEAST):
         return []
     times, low, high = one.scale, one.scale_low, one.scale_high

@@ -128,7 +128,7 @@ class LinkWithScaledNoise(eqx.Module):
     def __call__(self, numbers: Array) -> AbstractRandomAffine:
         """Return the link of these declared numbers, with its noise scaled."""
         link = self.make(numbers)
-        # Class: how many edges the mean logarithm of the variances is above.
+        # Class of the message: how many `edges` the mean logarithm of its variances is above.
         size = jnp.mean(jnp.log(list_noise_variances(link)))
         scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
 
@@ -153,7 +153,10 @@ def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares_noise(affine: ToldMap) -> bool:
-    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise."""
+    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise.
+
+    ALMOST: by which part of itself the number is moved. A map that is told its gain declares no noise.
+    """
     if isinstance(affine.make, ToldGainHop):
         return False
     typical = np.asarray(affine.typical)
@@ -184,7 +187,10 @@ def refit_filter(declared: DeclaredRows, logs: Array) -> ToldFilter:
     filter, numbers, place = declared.filter, jnp.exp(jnp.asarray(logs)), declared.place
 
     def rescale(leaf: object) -> object:
-        """Return the judged link's map with its noise scaled; anything else as it is."""
+        """Return the judged link's map with its noise scaled; anything else as it is.
+
+        The link is known by its memory. `numbers`: the scale of each class of its messages, which `edges` part.
+        """
         if not isinstance(leaf, ToldMap) or leaf.memory.identity != place.told.memory.identity:
             return leaf
         scaled = LinkWithScaledNoise(leaf.make, declared.edges, numbers[: declared.classes])
@@ -237,12 +243,13 @@ def refit_scales(declared: DeclaredRows) -> Refit:
 
 
 def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
-    """Return the scales, and the deviation and memory of a bias of each output, that fit best.
+    """Return the scales, and the deviation and memory of a bias of each output, that fit best, as logarithms.
 
-    `scales`: the best without a bias, from which the search begins.
+    `scales`: the best without a bias, from which the search begins, once for each memory of TIMES in steps.
     """
     step = find_median_step(declared)
     white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
+    # Behind the scales: the bias's deviation over the root of its memory, and its memory.
     starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
     return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
 
@@ -267,7 +274,10 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
     constrained = best
 
     def compute_excess_fall(distance: float) -> float:
-        """Return by how much the likelihood falls at this distance from the best number, less REACH."""
+        """Return by how much the log-likelihood falls at this distance from the best number, less REACH, 1.92 nats.
+
+        All other numbers are at their best there. `number`: which one it is; `sign`: in which direction.
+        """
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()
         start[number] = best.logs[number] + sign * distance
@@ -309,7 +319,8 @@ def _maximise_likelihood(
     def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
         """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
 
-        `logs`: the free ones of all logarithms.
+        `logs`: the free ones of all logarithms, the others staying as in `start`. `moves`: a row for each free one,
+        which moves it by DIFFERENCE. A likelihood that is no number counts as LOST nats below any.
         """
         all_logs = start.copy()
         all_logs[free] = logs

@@ -27,8 +27,8 @@ REMEDY = "on the circle that is no Gaussian any more: start from an angle that d
 def find_largest_usable_deviation(filter: AbstractFilter) -> float:
     """Return the deviation of an angle up to which a filter can take it for a Gaussian, in radians.
 
-    No more than WIDE; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may not lie
-    beyond half a turn, where they are taken for points of the other side.
+    No more than WIDE, 1 rad; and the points of a cubature or unscented filter, sqrt(c) deviations from the mean, may
+    not lie beyond half a turn, where they are taken for points of the other side. c: n states, or alpha^2 (n + kappa).
     """
     inner = getattr(filter, "base", filter)
     transform, n = getattr(inner, "transform", None), len(filter.states)
@@ -92,7 +92,10 @@ class WideAngles:
         self._most = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each received angle that is beyond a full turn for the first time."""
+        """Return a row and a line for each received angle that is beyond a full turn (TURN) for the first time.
+
+        `received`: names of the angles of which nothing was said yet, by component; one that is said is taken out.
+        """
         said = []
         for i in list(self.received):
             far = np.flatnonzero(np.abs(values[:, i]) > TURN)
@@ -101,7 +104,11 @@ class WideAngles:
         return said
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each angle that is known so badly for the first time."""
+        """Return a row and a line for each angle whose deviation is above `_most` radians for the first time.
+
+        Beyond that the filter cannot take it for a Gaussian. `states`: names of the angles of which nothing was said
+        yet, by state; one that is said is taken out.
+        """
         said = []
         for i in list(self.states):
             wide = np.flatnonzero(variances[:, i] > self._most**2)
@@ -125,7 +132,7 @@ def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, Abs
 def _yield_deviations(
     network: Network, filter: AbstractFilter, covariance: Float[np.ndarray, "*steps n n"]
 ) -> Iterator[tuple[str, Float[np.ndarray, "*steps"]]]:
-    """Yield the name and the deviation of each angle of a filter that claims this covariance."""
+    """Yield the name and the standard deviation (radians) of each angle of a filter that claims this covariance."""
     used = filter.angles_used()
     for i in () if used is None or filter.claim == "none" else used.states:
         yield network.states[i], np.sqrt(np.maximum(np.nan_to_num(covariance[..., i, i]), 0.0))
@@ -167,7 +174,7 @@ def doubt_degrees(name: str, value: float) -> str:
 
 
 def doubt_angles_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
-    """Yield a line for each measured angle with values beyond a full turn, as degrees have."""
+    """Yield a line for each measured angle with values beyond a full turn (TURN, 2 pi): they may be degrees."""
     for name, angles in network.angles.items():
         names = network.nodes[name].received_names if angles else ()
         for i in angles:

@@ -52,7 +52,7 @@ def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
-    """Return the claim of each estimate by node and filter, with what the filter believes that is not the node's."""
+    """Return the claim of each estimate by node and filter, with the models of the filter that are not the node's."""
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
     for belief in yield_mistaken_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
@@ -60,7 +60,10 @@ def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
 
 
 def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> str:
-    """Return in words what a node receives, through which hops, and its filters with their `claims` by name."""
+    """Return in words what a node receives, through which hops, and its filters with their `claims` by name.
+
+    It receives its own sensor's signal, rows of the channel that all nodes share (`common`), or what relays send.
+    """
     node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
     if isinstance(node, Node):
@@ -94,7 +97,7 @@ def list_shared_in_words(network: HasNodes) -> list[str]:
 
 
 def list_rounded_numbers(network: HasNodes) -> list[str]:
-    """Return which numbers came in rounded to single precision, with the parts that hold them."""
+    """Return lines on which numbers of the models were rounded to single precision, with the parts that hold them."""
     return [
         f"rounded to single precision before they came in: {describe_rounded(rounded)} ({join_names(names)})"
         for rounded, names in find_rounded_parts(network).items()
@@ -107,7 +110,7 @@ def write_diagram(network: HasNodes) -> str:
 
 
 def write_short_diagram(network: HasNodes) -> str:
-    """Return the diagram cut to the lines, and their length, that any object is shown in; … stands for the rest."""
+    """Return the diagram cut to LINES lines, and to the length of line that any object has; … stands for the rest."""
     lines = _format_lines(network)
     if len(lines) > LINES:
         hidden = len(lines) - (LINES - 1)
@@ -138,7 +141,10 @@ def write_html_table(network: HasNodes) -> str:
 
 
 def link_in_words(channel: Channel) -> str:
-    """Return a channel in words, such as "Rician hop → hop of gain 1.1, 10% lost"; `direct` where z = y."""
+    """Return a channel in words, such as "Rician hop → hop of gain 1.1, 10% lost"; `direct` where z = y.
+
+    One that JAX traces has no numbers to be told, but its class.
+    """
     if isinstance(channel, OverTime):
         return f"varying over time, at first {link_in_words(first(channel))}"
     if is_traced(channel):

@@ -79,7 +79,10 @@ def _doubt_unseen_states(network: Network, record: Record) -> Iterator[str]:
 def _find_unseen_states(
     view: "_FilterView", means: Float[np.ndarray, "time n"], covariances: Float[np.ndarray, "time n n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which states outputs depend on at the start, but neither at the last estimate nor LAST rows before it."""
+    """Return which states outputs depend on at the start, but neither at the last estimate nor LAST rows before it.
+
+    `view`: how a filter sees plant and sensors; it depends on the estimate where these are not linear.
+    """
     plant = view.plant
     start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
     end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
@@ -120,7 +123,7 @@ def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str,
     """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
     every = list_sensors(network)
     for name, node in network.nodes.items():
-        sensors = [node.sensor] if isinstance(node, Node) else every
+        sensors = [node.sensor] if isinstance(node, Node) else every  # others hear what several nodes send
         yield from ((name, label, one, sensors) for label, one in node.filters.items() if one.claim != "none")
     for label, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.claim != "none":
@@ -145,8 +148,9 @@ class _FilterView(NamedTuple):
     ) -> Bool[np.ndarray, " n"]:
         """Return which states change an output within some steps, for a filter with this mean and covariance.
 
-        Of a tangent those whose column of the observability matrix is not zero. Of points also those for which outputs
-        differ at mean +- sqrt(n) deviations, where `Cubature` has its points if states are not correlated.
+        Of a filter that takes tangents (`self.tangent`) those whose column of the observability matrix is not zero. Of
+        one that takes points also those for which outputs differ at mean +- sqrt(n) deviations, where `Cubature` has
+        its points if states are not correlated.
         """
         by_tangent = np.any(make_observability_matrix(self.plant, self.sensors, mean, steps) != 0, axis=0)
         if self.tangent or np.all(by_tangent):

@@ -90,7 +90,10 @@ def doubts_before_data(network: Network) -> list[Doubt]:
 
 
 def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
-    """Yield how often the words of a node are overloaded before any data, and what that may do to a claim."""
+    """Yield how often a node's words of few bits will be overloaded: values beyond their range, expected before data.
+
+    A doubt is serious (True) where the bound on that probability is above SEEN.
+    """
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
             yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
@@ -125,7 +128,7 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
-    """Yield what the certificate of boundedness says of all nodes together, and of each alone."""
+    """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
     yield from _doubt_error_bound(network, "the mean error of every filter", True)
     alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
@@ -144,7 +147,8 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
 def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
     """Yield a doubt where the error of the best filter of all nodes grows without end, or this cannot be decided.
 
-    `what`: whose error, in words. `serious`: whether its growth is.
+    `what`: whose error, in words. `serious`: whether its growth is a serious doubt; then it is also said where nobody
+    can judge it.
     """
     try:
         boundedness = certify_boundedness(network)
@@ -181,7 +185,7 @@ def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
-    """Yield a line on the nodes whose messages declare their noise, which is taken for true."""
+    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
     names = []
     for name, node in network.nodes.items():
         told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
@@ -206,7 +210,10 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
-    """Yield the filters that believe another world than that in which they stand, so that they claim nothing of it."""
+    """Yield a doubt for filters made for other models than those where they stand, alike ones in one line.
+
+    `forgetful`: nodes, by filter, where it ignores the memory of their links. `lowered`: the claim was lowered for it.
+    """
     alike: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
@@ -220,7 +227,7 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
-    """Yield filters that take draws as independent over time behind a link whose gains are not."""
+    """Yield a doubt for filters that take a link's draws as independent over time, though its gains have memory."""
     for label, names in _list_forgetful_nodes(network).items():
         words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
         yield Doubt(
@@ -235,7 +242,10 @@ def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:
 
 
 def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
-    """Return, by name of the filter, the nodes at which it ignores the memory of their links."""
+    """Return, by name of the filter, the nodes at which it takes a link with memory for one without.
+
+    Memory matters where gains are correlated over time; numbers that a link tells are fixed at typical ones.
+    """
     nodes: dict[str, list[str]] = {}
     for name, node in network.nodes.items():
         if not isinstance(node, Node):

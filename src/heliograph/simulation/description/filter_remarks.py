@@ -13,7 +13,7 @@ Place = tuple[str, str]  # node and filter
 
 
 def find_remarking_filters(network: Network) -> tuple[Place, ...]:
-    """Return the places of the filters that may remark on their state."""
+    """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node"."""
     places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
     fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
     return *places, *fused

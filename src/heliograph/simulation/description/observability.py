@@ -26,7 +26,7 @@ def list_sensors(network: Network) -> list[AbstractSensor]:
 def make_observability_matrix(
     plant: AbstractPlant, sensors: Sequence[AbstractSensor], state: Float[np.ndarray, " n"], steps: int
 ) -> Float[np.ndarray, "rows n"]:
-    """Return d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
+    """Return the observability matrix d(y_1, ..., y_steps)/dx_0 at a state, all sensors stacked, with inputs of 1."""
     return np.asarray(_differentiate_outputs(plant, tuple(sensors), state, np.arange(steps)))
 
 
@@ -41,7 +41,7 @@ def simulate_outputs(
 def _differentiate_outputs(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], state: Float[Array, " n"], rows: Int[Array, " steps"]
 ) -> jax.Array:
-    """Return d(outputs of all rows)/dx_0 (rows, n)."""
+    """Return d(y_1, ..., y_steps)/dx_0 at `state`, of the outputs of all sensors, (outputs of all steps, n)."""
     jacobian: jax.Array = jax.jacfwd(lambda x: _measure_rows(plant, sensors, x, rows))(state)
     return jacobian
 
@@ -53,7 +53,7 @@ def _measure_from_states(
     states: Float[Array, "states n"],
     rows: Int[Array, " steps"],
 ) -> jax.Array:
-    """Return the outputs of all rows from each state (states, rows)."""
+    """Return the outputs y_1, ..., y_steps of all sensors, one after another, from each state: (states, rows)."""
     return jax.vmap(lambda x: _measure_rows(plant, sensors, x, rows))(states)
 
 
@@ -64,7 +64,7 @@ def _measure_rows(
     u = jnp.ones(len(plant.inputs))
 
     def step(x: jax.Array, _: object) -> tuple[jax.Array, jax.Array]:
-        """Move the state, and measure it by all sensors."""
+        """Return the state after a step without noise, with inputs u, and what all sensors measure there."""
         x = plant.transition(x, u)
         return x, jnp.concatenate([sensor.under(plant.inputs, u).measure(x) for sensor in sensors])
 

@@ -16,7 +16,10 @@ Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
 
 
 def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
-    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}."""
+    """Return {(number as it was meant, as it is rounded): names of the parts of the network that hold it}.
+
+    Rounded to single precision; of each model only the first such number is named.
+    """
     parts: dict[tuple[float, float], list[str]] = {}
     seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models_with_calls(network):
@@ -53,7 +56,10 @@ def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
 
 
 def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
-    """Return the arrays that a function of a model holds; none of one that cannot be traced by itself."""
+    """Return the arrays that a function of a model holds, as its trace shows them.
+
+    None of a function that cannot be traced by itself with these arguments.
+    """
     try:
         return [x for x in constants(function, *arguments)[0] if not is_traced(x)]
     except (InputError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):

@@ -17,7 +17,7 @@ SHOWN = 3  # of many that are refused for one reason
 
 
 def explain_xla_fallbacks(network: Network) -> list[str]:
-    """Return a line for each reason for which XLA computes filters or fusions: who, and why."""
+    """Return a line for each reason for which XLA, not this library's native code, computes filters: who, and why."""
     by_reason: dict[str, list[str]] = {}
     for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
         by_reason.setdefault(why, []).append(who)
@@ -39,7 +39,7 @@ def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield each filter whose step is refused, with the reason."""
+    """Yield each filter whose step native code refuses, so that XLA computes it, with the reason."""
     for who, named in _list_filters(network):
         filter = without_output_names(named)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
@@ -54,9 +54,10 @@ def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
 
 
 def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield each fusion between neighbours whose step is too long to be written out."""
+    """Yield each fusion between neighbours whose step is too long to be written out as native code, with the reason."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
+        # Those of more than DENSE nodes cannot be built where the joint covariance of their errors is needed.
         if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).has_long_step:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
 

@@ -134,6 +134,7 @@ def _compute_normalised_square(
     both_present = present[..., :, None] & present[..., None, :]
     filled = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
     errors, sizes = np.where(present, x, 0.0), np.nan_to_num(size)
+    # One matrix after another, whatever the leading axes are.
     squares = _square_distances(filled.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
     return np.asarray(np.where(present.any(axis=-1), np.asarray(squares).reshape(x.shape[:-1]), np.nan))
 
@@ -202,7 +203,7 @@ def consistency(
 def _broadcast_degrees(
     dimension: ArrayLike, present: Bool[np.ndarray, "runs steps"]
 ) -> Float[np.ndarray, "runs steps"]:
-    """Return the degrees of freedom of each value, 0 where none is present.
+    """Return the degrees of freedom of each value, as an array like `present`; 0 where no value is present.
 
     Raises:
         ValueError: another shape, or degrees that are not positive.
@@ -222,7 +223,10 @@ def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -
 
 
 def _correlate_over_steps(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
-    """Return the correlation over 1, 2, ... steps of deviations from their mean; a missing one is given as zero."""
+    """Return the correlation over 1, 2, ..., `lags` steps of values given by their deviations from the mean.
+
+    `apart`: the deviations, 0 of missing values, which then add nothing.
+    """
     power = np.sum(apart**2)
     sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]
     return np.asarray([s / power if power > 0 else 0.0 for s in sums])

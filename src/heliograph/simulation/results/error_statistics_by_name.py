@@ -60,6 +60,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         units: Mapping[str, str] | None = None,
     ):
         super().__init__(by_node)
+        # Units that the states' names carry, and those given, which prevail.
         self.states, self.units = states, units_in(states) | dict(units or {})
         self.smoothed: StatisticsByName | None = None
 

@@ -163,7 +163,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def others(
         self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
-        """Return the statistics with those of smoothed estimates, which have these claims, as their `smoothed`."""
+        """Return the statistics of filtered estimates, with those of the smoothed ones as their field `smoothed`.
+
+        `claims`: of the smoothed estimates' covariances, by node and filter.
+        """
         results = {
             node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
             for node, filters in smoothed.items()
@@ -189,7 +192,8 @@ class _FilterSums(NamedTuple):
 
 def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> ErrorStatistics:
     """Return the statistics of one filter from its sums over runs; `count`: runs in each batch."""
-    tests = 0 if claim == "none" else slice(None)  # means alone are tested where no covariance is claimed
+    # Failures are counted by test, of means first: those alone are tested where no covariance is claimed.
+    tests = 0 if claim == "none" else slice(None)
     return ErrorStatistics(
         count=count,
         pairs=sums.pairs,
@@ -268,7 +272,10 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 
 
 def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[int, ...]) -> OfStep:
-    """Return the sums of one run's estimates of one filter, by step, as a simulation makes them."""
+    """Return the sums of errors of one run's estimates of one filter, by step, as a simulation makes them.
+
+    The filter is given as a fused one without a name, since a step of a simulation has estimates by name.
+    """
     estimate = Estimate(mean, covariance, "none", attitude=attitude)
     steps = {"truth": truth, "estimates": (), "fused": {"": estimate}, "uplinks": {}}
     return reduce_rows(Statistics(), steps)

@@ -31,7 +31,10 @@ def read_modes(estimate: Estimate) -> np.ndarray:
 
 
 def drop_unused_modes(modes: np.ndarray | None) -> np.ndarray | None:
-    """Return the modes' probabilities without those that are NaN at all times; None where nothing is left."""
+    """Return the probabilities of modes (..., M) without modes that are NaN at all times; None where none is left.
+
+    A dataset has as many for all filters, NaN of those that a filter does not have.
+    """
     if modes is None:
         return None
     used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
@@ -145,7 +148,8 @@ class FilterLabels:
     def fill_field(self, name: str, parts: Iterable[Placed[ArrayLike]]) -> np.ndarray:
         """Return the array of a field with these parts at their places along node, or node and filter; NaN elsewhere.
 
-        A part that is shorter than its axis, as measurements of a node may be, fills the beginning.
+        A part that is shorter than its axis, as measurements of a node may be, fills the beginning. `rows`, `lengths`:
+        lengths of the axes of rows, and of all further ones.
         """
         sizes = {"node": len(self.nodes), "filter": len(self.filters), "state": len(self.states)}
         sizes |= {"other": len(self.states), **self.rows, **self.lengths}
@@ -173,7 +177,10 @@ class FilterLabels:
         return claims
 
     def make_attitude_field(self) -> dict[str, np.ndarray]:
-        """Return the field of which states are the rotation vectors of attitudes; no field where none are."""
+        """Return the field that says which states are the rotation vectors of attitudes; no field where none are.
+
+        By state its place among all their numbers, -1 of other states.
+        """
         places = next((places for _, places in self.list_placed(lambda result: result.attitude) if places), ())
         order = np.full(len(self.states), -1, dtype=np.int64)
         order[list(places)] = np.arange(len(places))
@@ -253,7 +260,7 @@ def iterate_filters(
     claim = read_values(dataset, "claim", lead)
     fields = {name: read_values(dataset, name, lead) for name in names}
     node_axes = {name: list_axes(name, lead).index("node") for name in names}
-    for i, j in zip(*np.nonzero(claim != ""), strict=True):
+    for i, j in zip(*np.nonzero(claim != ""), strict=True):  # "": node i has no filter j
         # All rows, whose axes stand before that of nodes, of node i and filter j.
         values = {name: field[(*(slice(None),) * node_axes[name], i, j)].copy() for name, field in fields.items()}
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
@@ -261,6 +268,7 @@ def iterate_filters(
 
 def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.ndarray]) -> Estimate:
     """Return the estimate of a filter of a dataset, from its values by field as `iterate_filters` yields them."""
+    # By state its place among the numbers of all attitudes' rotation vectors, -1 of other states.
     order = read_values(dataset, "attitude", []) if "attitude" in dataset else np.zeros(0, dtype=np.int64)
     attitude = tuple(int(i) for i in np.argsort(order, kind="stable") if order[i] >= 0)
     modes = drop_unused_modes(values.get("modes"))
@@ -268,7 +276,10 @@ def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.n
 
 
 def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplink]":
-    """Return the uplinks of a dataset, by the fusion's name; `lead`: the axes of rows."""
+    """Return what nodes sent to fusions (uplinks), by the fusion's name, from a dataset; `lead`: the axes of rows.
+
+    SENT: the fields of an uplink, whether a quantizer saturated and how many symbols it sent.
+    """
     if "place" not in dataset:
         return {}
     senders, places = read_labels(dataset, "sender"), read_values(dataset, "place", lead)
@@ -283,7 +294,7 @@ def read_uplinks(dataset: "xr.Dataset", lead: Sequence[str]) -> "dict[str, Uplin
 
 
 def make_name_array(names: Sequence[str]) -> np.ndarray:
-    """Return the names as an array of objects, whatever characters they have."""
+    """Return the names as an array of Python's texts, since one of fixed-length texts would drop final zero bytes."""
     texts = np.empty(len(names), dtype=object)
     texts[:] = names
     return texts
@@ -297,14 +308,17 @@ def check_title(dataset: "xr.Dataset", title: str) -> None:
 
 
 def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
-    """Return the labels of a dimension of a dataset."""
+    """Return the labels of a dimension of a dataset, such as the names of nodes; raise ValueError where it lacks."""
     if axis not in dataset.dims:
         raise fail("dataset", f"the dimension {axis!r}, also where it has one label", f"{list(dataset.dims)}")
     return [str(name) for name in dataset[axis].values]
 
 
 def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.ndarray:
-    """Return the values of a field with its axes in their order; `lead`: the axes of rows."""
+    """Return the values of a field with its axes in the order of `list_axes`, or raise ValueError where it has others.
+
+    `lead`: the axes of rows, such as run and time, which stand first.
+    """
     axes = list_axes(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
         came = list(dataset[name].dims) if name in dataset else "no such variable"

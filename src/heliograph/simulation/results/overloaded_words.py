@@ -10,7 +10,7 @@ Overloads = TypeAliasType("Overloads", dict[str, dict[str, Overload]])  # by nod
 
 
 def find_overloads(network: object) -> Overloads:
-    """Return the overload of the words that each linear filter takes, by node and filter, of those that take words.
+    """Return how often words are overloaded, sent for values beyond their range, by node and filter that takes words.
 
     Args:
         network: a network; of any other model there are none.

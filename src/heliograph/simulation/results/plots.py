@@ -152,6 +152,7 @@ def insert_gaps_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) 
         others: what has a gap in the same places, each (time,).
     """
     time, mean = np.asarray(time), np.asarray(mean)
+    # Before these rows a NaN is inserted, at the row's time, which breaks the curve.
     jumps = np.flatnonzero(np.abs(np.diff(mean)) > np.pi) + 1
     if not jumps.size or np.nanmax(np.abs(mean)) > np.pi + 1e-9:
         return time, mean, *others

@@ -112,7 +112,7 @@ class Record(SavableResults):
         return write_record_html(self)
 
     def with_origin(self, origin: Origin) -> "Record":
-        """Return the same record with the states in which its filters ended."""
+        """Return the same record with the states in which its filters ended, from which more rows can be filtered."""
         changed = copy(self)
         vars(changed)["origin"] = origin
         return changed
@@ -124,7 +124,7 @@ class Record(SavableResults):
 
     @property
     def runs(self) -> int | None:
-        """Number of Monte Carlo runs; None for one recording."""
+        """Number of Monte Carlo runs, the first of three axes of all arrays; None for one recording, of two axes."""
         means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
         every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
         return len(every[0]) if every and every[0].ndim == 3 else None
@@ -197,7 +197,7 @@ class Record(SavableResults):
         return nees(truth, np.where(sound, truth - errors, np.nan), claimed)
 
     def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
-        """Summarise the innovations of a filter that weighs, output after output: what it used, weights, bias, size.
+        """Return a summary of innovations for each output of a filter that weighs: what it used, weights, bias, size.
 
         Raises:
             ValueError: no such filter, one that weighs nothing, or a simulation, whose weights `filter.run` has.
@@ -303,7 +303,7 @@ class Record(SavableResults):
         return cls(**read_frame(frame))
 
     def apart(self) -> list[str]:
-        """Return the names of the parts that are saved separately."""
+        """Return the names of the parts that `save` leaves out of a file, and that are saved separately."""
         return super().apart() + [
             name for name in ("reports", "transmissions", "weighed", "refused") if getattr(self, name)
         ]
@@ -389,7 +389,10 @@ class Record(SavableResults):
 
 
 def describe_bad_steps(bad: np.ndarray) -> list[str]:
-    """Return [a phrase: from which step on, in how many runs, flags `bad` (..., time) hold]; [] where they never do."""
+    """Return a list of one phrase: from which step on, and in how many runs, the flags `bad` (..., time) hold.
+
+    An empty list where they never do.
+    """
     if not np.any(bad):
         return []
     by_time = bad.reshape(-1, bad.shape[-1])

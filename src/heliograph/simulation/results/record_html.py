@@ -83,7 +83,7 @@ def write_record_html(record: DrawableRecord) -> str:
 
 
 def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str:
-    """Return a line of the filters with their colours and claims, and of the truth where it is drawn."""
+    """Return a line of HTML with the filters' names, colours and claims, and the truth where it is drawn."""
     entries = [
         (f"background:{colour}", f"{name} ({estimate.claim})")
         for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)
@@ -139,7 +139,10 @@ def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state:
 
 
 def _read_curve(estimate: Estimate, state: int, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mean, lower and upper end of the band of a state in the chosen rows; NaN where nothing is claimed."""
+    """Return mean, lower and upper end of the band of a state in the chosen rows; the ends are NaN without a claim.
+
+    The band is SIGMAS (2) claimed deviations to either side.
+    """
     mean = np.asarray(estimate.mean)[chosen, state]
     variance = np.asarray(estimate.covariance)[chosen, state, state]
     claimed = (variance >= 0) & (estimate.claim != "none")
@@ -154,6 +157,7 @@ def _find_range(parts: Sequence[np.ndarray]) -> tuple[float, float]:
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
+    # 4 % on either side; LEAST of the size, 1e-12, where all values are equal.
     room = max(0.04 * (high - low), LEAST * max(abs(low), abs(high), 1.0))
     return low - room, high + room
 
@@ -170,7 +174,10 @@ def _split_at_gaps(finite: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
-    """Return a curve of heights y as an SVG path with more attributes, broken where there is no value."""
+    """Return a curve of heights y as an SVG path with more attributes, broken where there is no value (NaN).
+
+    SVG: M moves the pen, L draws a line to a point.
+    """
     x = _compute_x_places(len(y))
     d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
     return (
@@ -180,7 +187,10 @@ def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
 
 
 def _yield_band_paths(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
-    """Yield the outlines of a band between two curves of heights, as SVG paths, one for each piece without a gap."""
+    """Yield the outlines of a band between two curves of heights, as SVG paths, one for each piece without a gap (NaN).
+
+    Along the upper curve and back along the lower one; Z closes the outline.
+    """
     x = _compute_x_places(len(lower))
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):
         ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]

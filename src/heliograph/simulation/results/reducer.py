@@ -77,7 +77,7 @@ class AbstractReducer(Module, Generic[Result]):
     def split_by_name(
         self, network: Network, collected: PyTree, read: Callable[[PyTree], Any], axis: int
     ) -> dict[str, dict[str, np.ndarray]]:
-        """Split what was collected of estimates by node and filter, for `finish`.
+        """Return what was collected of estimates, split by node and filter, as `finish` needs it.
 
         Args:
             network: the network.
@@ -136,7 +136,7 @@ class Trajectories(AbstractReducer[Record]):
         )
 
     def others(self, filtered: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
-        """Return the record with that of smoothed estimates, which have these claims, as its `smoothed`.
+        """Return the record of filtered estimates, with that of the smoothed ones, which have `claims`, as `smoothed`.
 
         Its time is that of the last steps if there are fewer.
         """

@@ -44,13 +44,17 @@ def list_refusals(
     counted = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
     for node, filters in weighed.items():
         for filter, parts in filters.items():
+            # A weight of 0: the filter left the reading out, for the reason "gate".
             gate = np.where(np.asarray(parts.weight) == 0, number_of_reason("gate"), 0)
             counted += _count_refusals(node, filter, gate)
     return tuple(counted)
 
 
 def _count_refusals(node: str, filter: str, refused: np.ndarray) -> Iterator[Refusal]:
-    """Yield, by component and reason, how many readings one table of reasons (time, received) has."""
+    """Yield, by component and reason, how many readings were refused, and the row of the first.
+
+    `refused`: number of each reading's reason (time, received), 0 of one that is kept; `filter`: "" of a node's own.
+    """
     for reason, counts in count_by_reason(refused).items():
         for i in np.flatnonzero(counts).tolist():
             row = int(np.argmax(refused[:, i] == number_of_reason(reason)))

@@ -36,7 +36,10 @@ def reports_by_name(
 
 
 def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str, SentReports]:
-    """Return by node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost."""
+    """Return by node what arrived from its neighbours (..., rounds times neighbours): 1 or the age, NaN if lost.
+
+    `arrived`: of the fusion `name`, (..., node, rounds, degree), flags, or ages in steps with -1 of what is lost.
+    """
     neighbours = network.meshes[name].neighbours or {}
     reports = {}
     for i, node in enumerate(network.mesh_nodes(name)):
@@ -44,6 +47,7 @@ def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str
             flags = arrived[..., i, :, 1 : count + 1]  # without the node's own message, and without padding
             ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
             values = ages.reshape(*flags.shape[:-2], -1)
+            # Messages that are late say so by their ages: the delays beside them are zeros.
             reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return reports
 
@@ -66,7 +70,7 @@ def split_measurements(
 
 
 def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return why the nodes' senders transmitted, by node, from (..., node, m) of groups by number."""
+    """Return why the nodes' senders transmitted, by node, from arrays (..., node, m) by number of the nodes' group."""
     return {
         name: np.asarray(node_group)[..., i, :]
         for group, node_group in groups.items()
@@ -75,7 +79,10 @@ def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> di
 
 
 def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[str, str], np.ndarray]:
-    """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter."""
+    """Return the modes' probabilities (..., M) of the filters that weigh modes, by node and filter.
+
+    `batch`: estimates of many steps, stacked by kind of filter, and fused ones by name; FUSED is the centre's "node".
+    """
     parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
     modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
     for name, place in network.places.items():
@@ -86,7 +93,10 @@ def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[st
 
 
 def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
-    """Return the innovations of the filters that weigh, by node and filter, from (time, filter, node, m) by kind."""
+    """Return the innovations of the filters that weigh what arrives, by node and filter; FUSED is the centre's "node".
+
+    `batch`: "weighed" has them by kind of filter, (time, filter, node, m), None of kinds that do not weigh.
+    """
     parts = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
     for (node, name), place in network.places.items() if parts else ():
@@ -123,7 +133,7 @@ def split_by_name(
 
 
 def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
-    """Return the uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
+    """Return what the nodes sent to each fusion (uplinks), by its name, from arrays whose last axes are (node, n)."""
     uplinks = {}
     for name, fusion in network.fused.items() if outcome else ():
         if isinstance(fusion, Fusion) and name in outcome:

@@ -152,10 +152,10 @@ def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
-    """Return names changed each by `change`: for files as texts of fixed length, else as objects."""
+    """Return names changed each by `change`: for files as texts of fixed length, else as Python's texts."""
     changed = [change(str(name)) for name in names.values]
     if change is quote_for_file:
         return np.array(changed, dtype="U")
-    texts = np.empty(len(changed), dtype=object)
+    texts = np.empty(len(changed), dtype=object)  # a fixed length would drop final zero characters
     texts[:] = changed
     return texts

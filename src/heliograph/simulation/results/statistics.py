@@ -46,7 +46,7 @@ class ErrorStatistics:
 
     @property
     def failure(self) -> str:
-        """Failure of the estimates in the words of a record's failures; empty without."""
+        """In words, from which step on and in how many runs estimates were not valid; empty where all were."""
         if not self.failed_runs:
             return ""
         what = "mean" if self.claim == "none" else "covariance"
@@ -95,12 +95,14 @@ class ErrorStatistics:
         The error of a root: se(mse) / (2 rmse), with se(mse) from the batch means.
         """
         self._warn_of_failures()
+        # `outer`: e e' summed over the runs of each batch, (batch, time, n, n).
         squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         return _root_mean(squared, self.count)
 
     def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
         self._warn_of_failures()
+        # `outer`: e e' summed over the runs of each batch, (batch, time, n, n).
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
         return np.array([root for root, _ in results]), np.array([error for _, error in results])
@@ -109,10 +111,10 @@ class ErrorStatistics:
         """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
         self._warn_of_failures()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
-        return np.sqrt(np.where(variance >= 0, variance, np.nan))
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))  # NaN of what is no variance
 
     def rmse_over_time(self) -> np.ndarray:
-        """Return the root mean squared error at each step, (time,)."""
+        """Return the root of the mean over runs of the squared error of all states, at each step, (time,)."""
         self._warn_of_failures()
         rmse: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
         return rmse
@@ -120,7 +122,8 @@ class ErrorStatistics:
     def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
         """Return the mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
 
-        The interval is from the batch means, so correlation over time within a run does not matter.
+        e: error of all n states, B: what the filter claims of its covariance. The interval is from the means of batches
+        of runs, so correlation over time within a run does not matter.
         """
         self._warn_of_failures()
         n = self.outer.shape[-1]
@@ -133,9 +136,9 @@ class ErrorStatistics:
     def worst_direction(self) -> "WorstDirection":
         """Return the largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, on runs that did not choose d.
 
-        The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
-        ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
-        not finite.
+        B is the claimed covariance. The even batches choose step and direction, the odd batches measure the ratio
+        there, and the reverse; so the ratio is not biased by the search. `z` is the excess over 1 in standard errors.
+        NaN where some error or bound is not finite.
 
         Raises:
             ValueError: fewer than 4 runs.
@@ -186,7 +189,7 @@ class ErrorStatistics:
 
 
 def expand_pairs(pairs: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrices (..., n, n) from their entries i <= j, row by row."""
+    """Return the symmetric matrices (..., n, n) from their entries i <= j, row by row, (..., n (n + 1) / 2)."""
     n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
     index = np.zeros((n, n), dtype=int)
     index[np.triu_indices(n)] = np.arange(pairs.shape[-1])
@@ -256,12 +259,16 @@ def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]
     groups = len(count)
     if groups < 2:
         return mean, float("nan")
+    # Batches may differ in their number of runs: sums less the mean times that number.
     scatter = np.sum((sums - mean * count) ** 2) * groups / (groups - 1)
     return mean, float(np.sqrt(scatter) / count.sum())
 
 
 def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
-    """Return the root of the mean of per-run values from their sums by batch, and its standard error."""
+    """Return the root of the mean of per-run values from their sums by batch, and its standard error.
+
+    d sqrt(m) = dm / (2 sqrt(m)). `count`: number of runs in each batch.
+    """
     mean, error = _average_batches(sums, count)
     root = float(np.sqrt(mean))
     return root, error / (2 * root) if root else 0.0
@@ -277,6 +284,7 @@ def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, 
     unit = np.where(of_b > 0, of_b, np.where(of_a > 0, of_a, 1.0))
     scale = unit[..., :, None] * unit[..., None, :]
     eigenvalues, vectors = np.linalg.eigh(b / scale)
+    # W: B's eigenvectors over the roots of its eigenvalues, those of zero taken as rounding.
     whitening = vectors / np.sqrt(np.maximum(eigenvalues, np.finfo(float).eps))[..., None, :]
     values, rotated = np.linalg.eigh(np.swapaxes(whitening, -1, -2) @ (a / scale) @ whitening)
     return values, (whitening @ rotated) / unit[..., None]

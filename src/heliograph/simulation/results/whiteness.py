@@ -198,7 +198,7 @@ def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
         """Return one row's log-likelihood and its whitened innovation (m,)."""
         used = ~jnp.isnan(innovation.value)
         if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
-            used &= innovation.weight >= HALF
+            used &= innovation.weight >= HALF  # half of a weight
         # Components that are not used: 0 of variance 1, correlated with none.
         covariance = jnp.where(used[:, None] & used, innovation.covariance, jnp.diag(jnp.where(used, 0.0, 1.0)))
         white = whiten(covariance, jnp.where(used, innovation.value, 0.0))

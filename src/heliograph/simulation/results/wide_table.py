@@ -86,7 +86,7 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
 
 
 def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
-    """Return the estimate of a node's filter; `key`: that of its covariance, which says the claim.
+    """Return the estimate of a node's filter from a table; `key`: that of its covariance, which says the claim.
 
     `places` of the columns and `values` (run, time, component), by key.
     """
@@ -105,7 +105,10 @@ def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key,
 
 
 def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
-    """Return what quantizers sent, by fusion, its nodes side by side; `values` (run, time, component) by key."""
+    """Return what quantizers sent, by fusion, its nodes side by side; `values` (run, time, component) by key.
+
+    A key: (node, fusion, quantity). SENT: the two quantities, whether a quantizer saturated and how many symbols.
+    """
     nodes_of: dict[str, list[str]] = {}
     for node, name, quantity in values:
         if quantity == SENT[0]:
@@ -117,7 +120,10 @@ def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
 
 
 def _keep_labels(columns: Sequence[Column]) -> Any:
-    """Return the column labels as they are: none is converted to a number or to a missing value."""
+    """Return the column labels as an index of pandas, as they are: none becomes a number or a missing value.
+
+    LEVELS: names of the parts of a label.
+    """
     import pandas as pd
 
     levels = [list(dict.fromkeys(column[i] for column in columns)) for i in range(len(LEVELS))]
@@ -126,7 +132,10 @@ def _keep_labels(columns: Sequence[Column]) -> Any:
 
 
 def _label_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
-    """Return the columns (run, time) of an estimate by label: means, covariances with their claim, modes."""
+    """Return the columns (run, time) of an estimate by label: means, covariances with their claim, modes.
+
+    A label: (node, filter, quantity, component, other); MODES is the quantity of the modes' probabilities.
+    """
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     # Of an attitude's numbers, which one: "0", "1", "2" of the first, and so on.
     order = {place: str(i) for i, place in enumerate(estimate.attitude)}

@@ -69,7 +69,7 @@ class _RowWithoutNode(NamedTuple):
 def _judge_rows(
     filters: Mapping[str, AbstractFilter], before: Mapping[str, PyTree], z: np.ndarray, u: np.ndarray, rows: np.ndarray
 ) -> Float[np.ndarray, "row filter 4"]:
-    """Return each filter's judgement of measurements for these rows, from its states before them.
+    """Return each filter's judgement whether measurements in these rows are plausible, from its states before them.
 
     The last axis: the fields of a Judgement. By native code where there is any, else by XLA.
 
@@ -92,7 +92,7 @@ def _judge_rows(
 
 
 def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:
-    """Return a filter's judgement of measurement z in step k, from its state before."""
+    """Return a filter's judgement whether measurement z is plausible in step k with inputs u, from its state before."""
     _, output = filter_step(filter, state, z, u, k, smooths=False, judges=True)
     assert output.judgement is not None  # as it judges
     return output.judgement

@@ -104,9 +104,10 @@ def find_filter_columns(network: Network, outputs: FlatLayout) -> tuple[FilterCo
 
 
 def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str], WeighingColumns]:
-    """Return the columns of what each filter that weighs made of its components, by node and filter.
+    """Return where a row of outputs has what each filter that weighs made of its components, by node and filter.
 
-    `outcome`: outputs of a step, with the numbers of their columns as values.
+    `outcome`: outputs of a step, with the number of its column in place of each value; by kind of filter, None of kinds
+    that do not weigh. FUSED is the "node" of central filters.
     """
     parts = {
         name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
@@ -122,7 +123,10 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
-    """Return the columns of each part of a judgement, by node and filter; `outcome` as of `_collect_weights`."""
+    """Return where a row of outputs has each field of a filter's judgement of its measurement, by node and filter.
+
+    `outcome`: outputs of a step, with the number of its column in place of each value. FUSED: of central filters.
+    """
     judged = {"estimates": outcome["judged"], "fused": {}}
     # Each field of the judgements, of which the axes are the last two, (filter, node).
     fields = range(len(JudgementColumns._fields))

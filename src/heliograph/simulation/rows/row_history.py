@@ -31,7 +31,10 @@ class RowHistory(NamedTuple):
     outputs: PyTree
 
     def read_row(self, row: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the measurements, the inputs and the time of a row."""
+        """Return the measurements, the inputs and the time of a row, which stand in it side by side.
+
+        `held` has as many inputs as a row gives.
+        """
         given = self.held.shape[1]
         numbers = self.rows[row]
         return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
@@ -49,7 +52,8 @@ class RowHistory(NamedTuple):
     def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return measurements and inputs at step k, which is the row's or one between it and the row before.
 
-        Between rows nothing is measured, and inputs are those held.
+        Between rows nothing is measured (NaN), and inputs are those held since the row before, as are inputs that the
+        row does not give (NaN).
         """
         received, given, step_of_row = self.read_row(row)
         is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]

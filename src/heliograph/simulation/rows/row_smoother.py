@@ -62,6 +62,7 @@ class BackwardSweep(Module):
         Returns:
             The filters' states after the step, and their smoother steps.
         """
+        # Where the row was judged at first, with the reason not to use a measurement: that holds again.
         by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
         after, outputs = self.network_step.filters.step(
@@ -79,7 +80,8 @@ class BackwardSweep(Module):
     ) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Return the smoothed estimates after a step: of nodes by kind, of the centre by name, with fused ones.
 
-        `steps`: smoother steps into it. `later`: each filter's Gaussian of the state given all data, in the same form.
+        `steps`: smoother steps into it, what each filter's backward pass needs. `later`: each filter's Gaussian of the
+        state given all data, in the same form.
         """
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
         # Fusions find their estimates by number of the kind: kinds that cannot be smoothed are None, and not fused.
@@ -91,7 +93,10 @@ class BackwardSweep(Module):
 
 
 def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *rest: PyTree) -> PyTree:
-    """Return function(step, ...) of every filter, by kind (filter, node, ...) and by name as `steps` and `rest`."""
+    """Return function(smoother step, ...) of every filter: of nodes by kind (filter, node, ...), central ones by name.
+
+    `rest`: its further arguments, in the form of `steps`: a pair of both.
+    """
     steps_by_kind, central_steps = steps
     by_kind = {}
     for kind, step in steps_by_kind.items():
@@ -154,10 +159,16 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
 
 
 def _make_step_into_row(dt: int) -> StepInto:
-    """Return the function that computes the smoother step into a row; `dt`: place of the time between rows in u."""
+    """Return the function that computes the smoother step into a row: what the backward pass needs of that step.
+
+    For continuous time, with one step for each row; `dt`: place of the time between rows among the inputs.
+    """
 
     def step_into_row(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
-        """Return the smoother step into a row from the state after the row before."""
+        """Return the smoother step into a row, of all filters, from their states after the row before.
+
+        `dt`: place of the time between rows among the inputs.
+        """
         row, _ = place
         state, (received, _, _) = sweep.states_after(history, row - 1), history.read_row(row)
         u = history.inputs_into_row(row, dt)
@@ -174,9 +185,9 @@ def _find_earlier_row(history: RowHistory, place: StepOfRow) -> StepOfRow:
 
 
 def _compute_step_into_k(sweep: BackwardSweep, history: RowHistory, place: StepOfRow) -> NetworkSmootherStep:
-    """Return the smoother step into step k, by way of the steps without measurements since the row before.
+    """Return the smoother step into step k, what the backward pass needs of it, of all filters.
 
-    `place`: the row that k is or leads to, and k.
+    They step on from the row before, without measurements up to k. `place`: the row that k is or leads to, and k.
     """
     row, k = place
 
@@ -240,9 +251,13 @@ class RowSmoother:
         return fusion.quantizers is None and all(kind in kinds for source in fusion.sources for kind, _ in source)
 
     def _find_program(self, history: RowHistory) -> Callable[[RowHistory, np.ndarray], PyTree]:
-        """Return the program for histories of this length, which an engine is chosen for once."""
+        """Return the program for histories of this length, kept by length: native code, or XLA's where that refuses.
+
+        `_numbers`: the arrays of the sweep, which are the program's first arguments.
+        """
         key = len(history.rows), read_forced_engine()
         if key not in self._programs:
+            # Rows from `begin` to `stop`; no argument has an axis of runs, since there is one run alone.
             span = np.zeros(2, dtype=np.int32)
             choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
             if choice.code is None:
@@ -283,7 +298,10 @@ def _take_only_run(results: PyTree) -> PyTree:
 
 
 def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> Estimate:
-    """Return the estimate at an index (filter, node) of stacked ones, with this claim where it is sound."""
+    """Return the estimate at an index (filter, node) of stacked ones, with this claim.
+
+    "none" where its mean is no number or its covariance is none.
+    """
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
     mean, covariance = (np.asarray(part)[index] for part in (outputs.mean, outputs.covariance))
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
@@ -295,7 +313,10 @@ def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:
-    """Return whether a filter can be smoothed: whether it puts out smoother steps, by the shapes of one."""
+    """Return whether a filter can be smoothed: whether it has smoother steps, what a backward pass needs of a step.
+
+    Only the shapes of one are computed; a filter without them raises InputError.
+    """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:
         with jax.enable_x64(True):

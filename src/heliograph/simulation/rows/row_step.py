@@ -45,13 +45,13 @@ class NetworkStep(Module):
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
-        """Hold the filters, and where the nodes' measurements stand."""
+        """Hold the filters, and by group the places of each node's measurements among those of all nodes."""
         rows = network.rows
         self.filters = filters
         self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """Step all filters, without implausible measurements: return their next states and the outputs.
+        """Return all filters' states after step k, taken without implausible measurements, and the outputs.
 
         `received`: measurements of all nodes in their order.
 
@@ -87,7 +87,7 @@ class RowLayout(NamedTuple):
         return self.state.size + self.received + self.inputs + 1
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
-        """Return the filters' states, the measurements, the inputs and the step number of a row."""
+        """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
         known, rest = row[: self.state.size], row[self.state.size :]
         u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
         return self.state.tree(known), rest[: self.received], u, k
@@ -149,7 +149,8 @@ class RowStep:
     def _rows_of_call_and_turn(self) -> tuple[int, int]:
         """Return how many rows a call of XLA's program takes, and how many one turn of its loop.
 
-        The layout alone decides, so that a result depends on no number of rows.
+        The layout alone decides, so that a result depends on no number of rows. One turn steps at most TOGETHER rows in
+        parallel, one call at most WIDTH; fewer if rows are long, as NUMBERS_TOGETHER and NUMBERS limit their numbers.
         """
         longest = max(self._layout.size, self.state.size + self.outputs.size)
         together = min(max(NUMBERS_TOGETHER // longest, 1), TOGETHER)
@@ -230,7 +231,10 @@ class OneRowStep:
         self._steps, self._code = steps, code
 
     def __call__(self, *parts: Float[np.ndarray, "1 columns"]) -> Float[np.ndarray, "1 column"]:
-        """Step a row, given in parts that stand side by side; the result is overwritten by the next call."""
+        """Return the states and outputs after a row, given in parts that stand side by side.
+
+        By native code, or by XLA where there is none (`_code` is None). The next call overwrites the result.
+        """
         if self._code is None:
             return self._steps(np.concatenate(parts, axis=1), True)
         np.concatenate(parts, axis=1, out=self._code.inputs[0])
@@ -240,7 +244,10 @@ class OneRowStep:
 
 
 def _check_reports(filters: AllFilters) -> None:
-    """Raise ValueError for reports lost by chance: a row says what a node measured, not which report arrived."""
+    """Raise ValueError for nodes' reports to a centre over random links.
+
+    A row says what a node measured, not which report arrived.
+    """
     for name, by_report in filters.reporting.items():
         if by_report.uplinks.groups:
             expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
@@ -257,11 +264,11 @@ def _make_step(layout: RowLayout) -> Any:
     """Return the compiled function (numbers, row) -> (states after the row, outputs) of networks of one structure.
 
     `numbers` are the arrays of a network's step: networks that differ in these alone share the function, and its trace
-    serves the layout of the outputs, the native code and the program's text.
+    serves the layout of the outputs, the native code and the program's text. `layout.static`: all else of the step.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> tuple[PyTree, PyTree]:
-        """Step a row of the network that has these numbers as its arrays; return states and outputs."""
+        """Return states and outputs after a row, of the network whose step has these numbers as its arrays."""
         network_step = layout.static.with_arrays(numbers)  # the structure with these arrays put back into it
         stepped: tuple[PyTree, PyTree] = network_step.step(*layout.split_row(row))
         return stepped
@@ -271,7 +278,10 @@ def _make_step(layout: RowLayout) -> Any:
 
 @lru_cache
 def _make_row_function(layout: RowLayout) -> Any:
-    """Return the function (numbers, row) -> row of states and outputs, the same one for layouts that are equal."""
+    """Return the function (numbers, row) -> row of states and outputs, the same one for layouts that are equal.
+
+    `numbers`: the arrays of a network's step, `layout`: all else of it, and where a row's parts stand.
+    """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         """Step a row; return states and outputs side by side."""
@@ -281,9 +291,9 @@ def _make_row_function(layout: RowLayout) -> Any:
 
 
 def _trace_step(layout: RowLayout, numbers: tuple[jax.ShapeDtypeStruct, ...]) -> Any:
-    """Return the traced step of a row, which JAX holds for networks that differ in numbers alone.
+    """Return the step of a row as JAX traces it, which it keeps for networks that differ in numbers alone.
 
-    `numbers`: shapes and types of the step's arrays.
+    `numbers`: shapes and types of the step's arrays. `layout`: all else of it, and the length of a row.
     """
     with jax.enable_x64(True):
         return _make_step(layout).trace(list(numbers), _make_shape((layout.size,), np.float64))
@@ -305,10 +315,13 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
     step = _make_row_function(layout)
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        """Step the rows of the first `turns` turns; others stay zero."""
+        """Return the states and outputs after each of `width` rows, zero behind the first `turns` turns of the loop.
+
+        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step.
+        """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
-            """Step the rows of turn i, and put them among those done."""
+            """Return `done` with the `together` rows of turn i stepped, in parallel, at their places."""
             some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
             stepped = jax.vmap(lambda row: step(numbers, row))(some)
             return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)

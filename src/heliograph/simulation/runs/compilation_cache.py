@@ -40,7 +40,7 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
 
 
 def _find_default_folder() -> Path:
-    """Return the folder of compiled programs in the user's cache."""
+    """Return the folder of compiled programs in the user's cache, which the variable XDG_CACHE_HOME or ~ tells."""
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
     try:
@@ -50,7 +50,10 @@ def _find_default_folder() -> Path:
 
 
 def _make_private(path: Path) -> None:
-    """Make a folder to which nobody else can write; raise ValueError if it is another user's."""
+    """Make a folder to which nobody else can write; raise ValueError if it is another user's but root's (0).
+
+    PRIVATE: the mode of a folder of its owner alone; OTHERS_WRITE: the bits by which others may write.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=PRIVATE, exist_ok=True)

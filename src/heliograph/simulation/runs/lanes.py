@@ -54,12 +54,16 @@ class RunLanes:
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
         self.wide = devices > 1 or not processor
+        # Lanes: LANES or WIDE_LANES, rounded up to a multiple of the devices.
         self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
         self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None
 
     def advance(self, start: int, blocks: int) -> PyTree:
-        """Simulate `blocks` blocks from number `start` on; return what is collected, run by run, on the host."""
+        """Return what is collected of each run of `blocks` blocks, simulated from number `start` on, as NumPy arrays.
+
+        A block is BLOCK runs; blocks are dealt to the lanes in turn, and put in order again.
+        """
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
@@ -68,13 +72,16 @@ class RunLanes:
         return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), dealt), *recorded)
 
     def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Run each lane in a thread of its own, carrying its sums on; return what is recorded of each run, by lane.
+        """Return what is recorded of each run, by lane: each lane runs in a thread of its own, carrying its sums on.
 
         `runs` (block, BLOCK): numbers of the runs. `lanes`: which of these blocks are each lane's.
         """
 
         def advance_lane(lane: int) -> PyTree:
-            """Advance one lane over its blocks."""
+            """Return what is recorded of one lane's runs, its sums carried on from its earlier blocks.
+
+            `lanes`: which of the blocks in `runs` are each lane's.
+            """
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
                 self.carries[lane], recorded = self.alone(runs[lanes[lane]], carry)
@@ -85,9 +92,10 @@ class RunLanes:
         return list(self.pool.map(advance_lane, [lane for lane, blocks in enumerate(lanes) if len(blocks)]))
 
     def _run_on_devices(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
-        """Run all lanes at once, dealt to the devices; return what is recorded of each run, by lane.
+        """Return what is recorded of each run, by lane: all lanes run at once, dealt to the devices.
 
-        Arguments as of `_run_in_threads`; all lanes have as many blocks.
+        Arguments as of `_run_in_threads`; all lanes have as many blocks. `carries`: the lanes' sums so far, a list
+        before the first call, then stacked on the devices.
         """
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
@@ -99,7 +107,7 @@ class RunLanes:
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
-        """Return the sum of the lanes' carries, in their order."""
+        """Return the sum over all runs: that of the lanes' carries, their sums so far, always in the same order."""
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
@@ -131,12 +139,12 @@ def add_sums(total: PyTree, more: PyTree) -> PyTree:
 
 
 def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[range]:
-    """Split runs into chunks of at most about `chunk` runs: return the numbers of the blocks of each.
+    """Return the numbers of the blocks of each chunk of runs, of about `chunk` runs; a block is BLOCK runs.
 
     A chunk has fewer blocks than there are lanes, or a multiple of their number; the last may go beyond the runs.
 
     Args:
-        lanes: their number.
+        lanes: how many rows of blocks are computed side by side.
         wide: always a multiple of it.
         runs: how many there are.
         chunk: how many a chunk should have.
@@ -150,7 +158,7 @@ def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[ran
 def advance_in_chunks(
     advance: Callable[[int, int], PyTree], chunks: list[range], runs: int, progress: Progress | None
 ) -> list[PyTree]:
-    """Advance over all blocks, chunk by chunk, with progress between; return what each chunk collected.
+    """Return what is collected of each chunk, advancing over all blocks of BLOCK runs with progress in between.
 
     Args:
         advance: over (number of the first block, count of blocks); returns what is collected.
@@ -172,7 +180,10 @@ def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
 
 
 def _order_blocks(recorded: np.ndarray, dealt: np.ndarray) -> np.ndarray:
-    """Return what was recorded of blocks (block, BLOCK, ...) as (run, ...) in order; `dealt`: number of each block."""
+    """Return what was recorded of blocks of runs (block, BLOCK, ...) as (run, ...), in the order of the runs.
+
+    `dealt`: number of each block, as they were dealt to lanes.
+    """
     ordered = np.empty_like(recorded)
     ordered[dealt] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

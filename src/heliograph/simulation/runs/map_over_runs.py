@@ -16,7 +16,7 @@ WIDTH = 128  # runs in parallel: the smoother steps of a hundred steps of them s
 
 
 def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WIDTH) -> PyTree:
-    """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
+    """Return a function's results of many runs, which are the leading axis of every array and of every result.
 
     The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
     and its shapes, so define it once. NumPy arrays come back, and each core computes its share of the runs. Native code
@@ -59,7 +59,10 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     share = blocks * width
 
     def compute_share(core: int) -> PyTree:
-        """Return the results of one core's runs: blocks of `width` runs, filled up and cut again."""
+        """Return the results of one core's runs, `share` of all: `blocks` blocks of `width` runs in parallel.
+
+        Missing runs are filled up, and their results are cut off again.
+        """
         first, stop = core * share, min((core + 1) * share, runs)
         parts = [_pad_runs(a[first:stop], share).reshape(blocks, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
@@ -80,7 +83,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:
-    """Return numbers as an array, masked ones as NaN; raise ValueError for anything else."""
+    """Return numbers as an array, masked ones (as of numpy.ma) as NaN; raise ValueError for anything else."""
     try:
         values = np.asarray(fill_masked(value))
     except ValueError:  # rows of different lengths

@@ -50,7 +50,7 @@ def find_available_memory() -> float | None:
 
 
 def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
-    """Raise ValueError for runs that need more memory than there is; nothing where the machine does not say.
+    """Raise ValueError for runs that need more memory than there is; do nothing where the machine does not say.
 
     Raises:
         ValueError: more is needed, with both numbers, the largest part, and what needs less.
@@ -67,7 +67,7 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
 
 @contextmanager
 def explain_out_of_memory(runs: int, horizon: int) -> Iterator[None]:
-    """Say in one line that memory was not given after all, in place of an allocator's text.
+    """Raise one line for memory that was not given after all, in place of an allocator's text, inside of a `with`.
 
     Raises:
         ValueError: an allocation that failed.

@@ -99,10 +99,10 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
 
 @cache_by_object
 def _read_key(key: jax.Array) -> np.ndarray:
-    """Return the words of a key of JAX's own hash (2,), read once for all parts of a network.
+    """Return the two words of a random key of JAX's default hash, Threefry, read once for all parts of a network.
 
     Raises:
-        Unsupported: a key of another hash.
+        Unsupported: a key of another hash, which native code does not compute.
     """
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
@@ -128,7 +128,11 @@ class _KnownEntries:
 
     @classmethod
     def of(cls, array: np.ndarray) -> "_KnownEntries":
-        """Describe an array: shape, type, which of its entries are known to a program, and their values."""
+        """Return what is known of an array when a program is made: shape, type, and which entries with which values.
+
+        Known are zeros and ones, or all whole numbers; all else is an argument of the program. Of an argument of more
+        than FEW numbers nothing is known.
+        """
         known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
         if array.size > FEW and _is_argument(array):
             known[...] = False
@@ -182,7 +186,10 @@ class _Structure(NamedTuple):
 
 
 def _split_arrays(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
-    """Return a tree's structure and its arrays, of which `_Structure.restore` makes the tree again."""
+    """Return a tree's structure, which holds all leaves that are no arrays, and its arrays.
+
+    `_Structure.restore` makes the tree of them again. Structures of equal known entries share a program.
+    """
     leaves, structure = jax.tree.flatten(tree)
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
@@ -200,7 +207,9 @@ def _split_world(world: World) -> tuple[_Structure, tuple[np.ndarray, ...]]:
 def _find_program(
     world: _Structure, rest: _Structure, counting: bool, precision: Precision
 ) -> tuple[Any, Any] | Unsupported:
-    """Return what `_compile_program` does, cached, or the reason why there is none, which is cached so too.
+    """Return the program that `_compile_program` makes, cached, or the reason why there is none, which is cached too.
+
+    `world`, `rest`: all of what is simulated, and of what is made of it, but the arrays.
 
     `counting` (JAX's way of counting draws) is only part of the cache's key: what is traced depends on it.
     """
@@ -221,7 +230,7 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
     result_trees: list[Any] = []  # one, which is found when `run` is traced
 
     def run(key: jax.Array, *leaves: Any) -> tuple[PyTree, PyTree]:
-        """Simulate one run from the program's arrays and the run's number; return what is summed, and what is kept."""
+        """Return what is summed over runs, and what is kept of this one, from all arrays and, last, its number."""
         *arrays, number = leaves
         remaining = iter(arrays)
         world, (later, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
@@ -254,9 +263,9 @@ def _step_world(world: World, state: PyTree, key: jax.Array, row: tuple[jax.Arra
 
 
 def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
-    """Simulate a run with these inputs (horizon, inputs): return what the reducer collects, stacked over time.
+    """Return what the reducer makes of one run with these inputs (horizon, inputs), stacked over time.
 
-    Flags (`ever`) hold if true at any step.
+    The world: plant, channels and filters. The reducer's flags (`ever`) hold if true at any step.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
@@ -271,7 +280,10 @@ def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any]
 def _simulate_smoothed_run(
     world: World, later: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
-    """Simulate a run: return what the reducer collects of filtered and of smoothed estimates, as `reduce_run` does."""
+    """Return what the reducer makes of one run's filtered and smoothed estimates, as `reduce_run` does.
+
+    The world: plant, channels and filters; `later` smooths their estimates when the run is over.
+    """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step the world; the step is reduced later, with what comes after it."""
@@ -344,7 +356,7 @@ def _simulate_in_parts(
     results: list[Result] = []
 
     def finish_part(started: NativeRuns, some: Network) -> None:
-        """Append the result of the next part, of these nodes, and show its progress as that of the whole."""
+        """Append the result of the next of `parts` parts of a network to `results`; show its progress in the whole."""
 
         def show_progress(done: int, total: int) -> None:
             if progress is not None:
@@ -379,7 +391,10 @@ def compile_network_runs(
     smoothing: SmoothingPlan | None = None,
     precision: Precision = "float64",
 ) -> NativeProgram:
-    """Compile the native code of a network's runs, as `compile_runs` of its world; a part of it may be smoothed."""
+    """Return the native code of a network's runs, as `compile_runs` of its world: plant, channels and filters.
+
+    `smoothing`: the part of it whose estimates are smoothed, None for none.
+    """
     world = build_world(network, None if smoothing is None else smoothing.kinds)
     later = None if smoothing is None else smoothing.smoother(world.filters)
     return compile_runs(world, inputs, key, reducer, runs, later, precision=precision)

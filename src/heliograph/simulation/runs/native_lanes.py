@@ -46,7 +46,7 @@ class NativeRuns:
     def __init__(
         self, code: NativeProgram, first_run: int, runs: int, chunk: int, memory: list[list[np.ndarray]] | None = None
     ):
-        """Start the first chunk.
+        """Start the first chunk of runs, whose sums are kept for each of LANES lanes.
 
         Args:
             code: the program.
@@ -63,7 +63,7 @@ class NativeRuns:
         self._first = self._start(self.chunks[0])
 
     def complete(self, progress: Progress | None) -> ReducedRuns:
-        """Compute all other chunks; return the sums over all runs, and what is collected of them.
+        """Return the sums over all runs, and what is collected of each, having computed all chunks but the first.
 
         `progress` is called after each chunk with how many runs are done, and of how many.
         """
@@ -77,7 +77,7 @@ class NativeRuns:
         used = [lane for lane, runs in runs_of_lane.items() if len(runs)]
 
         def simulate_lane(lane: int) -> list[np.ndarray | None]:
-            """Add a lane's runs to its sums; return what is collected of them."""
+            """Return what is collected of a lane's runs, in a thread of its own; they are added to the lane's sums."""
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.make_zero_sums(self.memory)
             collected: list[np.ndarray | None] = self.code.begun.add_runs(runs_of_lane[lane], sums)
             return collected
@@ -88,7 +88,7 @@ class NativeRuns:
         )
 
     def _advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; return what is collected of their runs in order, by leaf.
+        """Return what is collected of the runs of `blocks` blocks from number `start` on, in order, by leaf of results.
 
         A leaf is (run, ...), None where all runs share it.
         """
@@ -106,7 +106,10 @@ class NativeRuns:
         return runs[runs < self.first_run + self.runs]
 
     def _total(self) -> ReducedRuns:
-        """Return the sums over all runs, by batch, and give their memory back; nothing that is collected."""
+        """Return the sums over all runs, by batch of runs, without what is collected; give the lanes' memory back.
+
+        `shared`: by result its value where it is the same in all runs, else None; `summed`: whether it is summed.
+        """
         code = self.code.begun
         used = [sums for sums in self.sums if sums is not None]
         totals = iter(code.add_partial_sums(used))
@@ -122,9 +125,9 @@ class NativeRuns:
         return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
 
     def _join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """Return what is collected of all runs (run, ...), from what `advance` returned of each chunk of them.
+        """Return what is collected of all runs (run, ...), from what `_advance` returned of each chunk of them.
 
-        A result that all runs share is a view of one.
+        A result that all runs share (`shared`, else None) is a view of one.
         """
         leaves: list[Any] = []
         for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):

@@ -28,7 +28,10 @@ NODES = 4  # simulated by one program: the plant is simulated again for each so 
 
 
 def is_apart(network: Network) -> bool:
-    """Return whether all nodes have filters and share nothing but the plant: no fusion, sensor, hop or memory."""
+    """Return whether all nodes have filters and share nothing but the plant: no fusion, sensor, hop or memory.
+
+    Then a few nodes can be simulated by themselves, with the same results.
+    """
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
     fused = network.fused or network.meshes
     return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
@@ -50,7 +53,9 @@ def count_parts(network: Network) -> int:
 
 @cache_by_object
 def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
-    """Split a network whose nodes are apart: return networks of a few nodes each, of one structure, and their worlds.
+    """Return networks of at most NODES nodes each, of one structure, and their worlds, of one whose nodes are apart.
+
+    Nodes are apart if they share nothing but the plant; a world is what is simulated: plant, channels and filters.
 
     The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
     than to simulate three hundred runs, and so would to split the network again for each simulation of it.
@@ -101,7 +106,7 @@ def _select_rows(world: World, nodes: slice) -> World:
     assert isinstance(world.medium, SeparateChannels)
 
     def select(leaf: PyTree) -> PyTree:
-        """Return the nodes' rows of an array."""
+        """Return the rows of `nodes` of an array that is stacked by node; anything else as it is."""
         return leaf[nodes] if eqx.is_array(leaf) else leaf
 
     medium = SeparateChannels(jax.tree.map(select, world.medium.groups))
@@ -114,7 +119,10 @@ def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:
     count = len(range(*nodes.indices(stacked.nodes)))
 
     def select(leaf: PyTree) -> PyTree:
-        """Return the nodes' rows of an array (filter and node, ...), for each filter."""
+        """Return the rows of `nodes`, `count` of them, of an array (filter and node, ...), for each filter.
+
+        `stacked`: how many filters and nodes it has. Anything but an array is returned as it is.
+        """
         if not eqx.is_array(leaf):
             return leaf
         by_filter = leaf.reshape(stacked.count, stacked.nodes, *leaf.shape[1:])

@@ -83,7 +83,10 @@ def filter_step(
 
 
 def get_weighed_components(innovation: Innovation) -> Weighed | None:
-    """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others."""
+    """Return value, variance and weight of each component of an innovation, of a filter that weighs; None of others.
+
+    A filter that weighs leaves out a part of what is unlikely: the weight is from 0 (left out) to 1.
+    """
     if innovation.weight is None:
         return None
     return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
@@ -128,7 +131,10 @@ class StackedFilters(Module):
         def step_one(
             filter: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
         ) -> tuple[PyTree, StepOutput]:
-            """Step one filter of one node."""
+            """Return one filter's state after step k with inputs u, and the outputs of its step, at one node.
+
+            `skip`: code of the reason not to use z, 0 where it is used. `smooths`, `judges`: which outputs are wanted.
+            """
             return filter_step(filter, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
@@ -148,7 +154,7 @@ class StackedFilters(Module):
 
     def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
         """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
-        rows = slice(f * self.nodes, (f + 1) * self.nodes)
+        rows = slice(f * self.nodes, (f + 1) * self.nodes)  # all nodes of the first filter stand first, and so on
         taken: tuple[AbstractFilter, PyTree] = jax.tree.map(
             lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states)
         )
@@ -172,7 +178,7 @@ def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]
 
 
 def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
-    """Apply a function of one to a stack of one, without the cost of `vmap`."""
+    """Return a function's result for a stack of one, as a stack of one, without the cost of `vmap`."""
 
     def drop_axis(leaf: PyTree) -> PyTree:
         """Return the only row of an array."""

@@ -92,6 +92,7 @@ def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> li
     """Return the leaves of `values` (or their shapes) on which some result of the function depends."""
     leaves, tree = jax.tree.flatten(values)
     traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
+    # JAX's removal of dead code says which arguments are used.
     _, used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
     return [leaf for leaf, is_used in zip(leaves, used, strict=True) if is_used]
 
@@ -99,7 +100,7 @@ def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> li
 def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
     """Return the leaves of all runs' first states, which of them differ between runs, and their structure.
 
-    Those that differ are (..., run).
+    `init`: makes a run's first state of its key. Leaves that differ between runs are (..., run), others without runs.
     """
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _mark_dependent_results(traced, [True])
@@ -114,7 +115,10 @@ def _drop_unused(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def _find_dependent_variables(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
-    """Return the variables that depend on the marked inputs; each operation is assumed to use all its arguments."""
+    """Return the variables of a traced program that depend on the inputs marked True.
+
+    Each operation is assumed to use all its arguments.
+    """
     marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
     for operation in program.jaxpr.eqns:
         if any(v in marked for v in operation.invars if not isinstance(v, Literal)):

@@ -48,7 +48,7 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Return the medium of a network's relays, which send in slots."""
+    """Return the medium of a network's relays: how they send to each other in slots, one after another in a step."""
     listeners = {name: i for i, name in enumerate(relays.filters)}
     return SlottedRelays(
         relays=relays,
@@ -106,6 +106,7 @@ def _split_seeds(observed: tuple[AnySensor, Channel], seeds: np.ndarray) -> tupl
 
     A memory that they share is in both.
     """
+    # A memory's identity: its name, or one of its own.
     by_identity = dict(zip(memories(observed), seeds, strict=True))
     of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
     return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

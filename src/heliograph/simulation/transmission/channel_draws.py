@@ -43,7 +43,7 @@ PLANT = "plant"  # whose memories others may share, with a name or without
 
 
 def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> dict[str, np.ndarray]:
-    """Return by channel the numbers that seed its memories' draws: equal ones for memories that are shared.
+    """Return by channel the numbers that seed its memories' draws, as of fading: equal ones for shared memories.
 
     They come from the memories' names, or from the channel's where these have none.
 
@@ -134,7 +134,7 @@ class LateChannelState(NamedTuple):
 
 
 def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
-    """Return a channel's state before the first step of the run with this key.
+    """Return a channel's state before the first step of the run with this key; a late one's has past signals, zeros.
 
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
     """
@@ -153,7 +153,10 @@ def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[
 def move_modes(
     models: PyTree, states: tuple[jax.Array, ...], key: jax.Array, k: jax.Array, shared: MemoryNumbers
 ) -> tuple[jax.Array, ...]:
-    """Return the states of the memories of a plant or sensor at the step after k; those of one number move alike."""
+    """Return the states of the memories (modes) of a plant or sensor at the step after k, drawn by the run's key.
+
+    `shared`: numbers that seed their draws; memories of one number move alike.
+    """
     moves = zip(memories(models).values(), states, shared, strict=True)
     return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in moves)
 
@@ -161,7 +164,7 @@ def move_modes(
 def deliver_signal(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, source: Number, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
-    """Draw the channel at step k and apply it to y, a late one to past signals too; return next state and output.
+    """Return a channel's next state, and what it makes of y at step k, a late one of past signals too.
 
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
     """
@@ -177,7 +180,10 @@ def deliver_signal(
 def _draw_link(
     link: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, link_key: jax.Array, shared: MemoryNumbers
 ) -> tuple[PyTree, jax.Array]:
-    """Draw a link, its memories by keys of their own; return its next state and its matrix."""
+    """Return a link's next state, and its matrix [G n; 0 1] drawn at step k, memories by keys of their own.
+
+    `shared`: numbers that seed the memories' draws; `link_key`: of all other draws.
+    """
     if not len(shared):
         return link.draw(state, link_key)
     return draw_with_shared_memories(link, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])

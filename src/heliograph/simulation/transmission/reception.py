@@ -44,7 +44,7 @@ class AbstractMedium(Module):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, Measurements]:
-        """Deliver the measurements of the nodes at step k: return the next state, and (node, received) by group.
+        """Return the medium's next state, and the measurements that nodes receive at step k, (node, received) by group.
 
         NaN where nothing arrives.
 
@@ -128,7 +128,7 @@ class SeparateChannels(AbstractMedium):
         """Return the links' states before the first step by group, (node, ...); () of nodes without a sensor."""
 
         def start_node(group: NodeGroup) -> LinkState:
-            """Return the initial state of one node's link."""
+            """Return the initial state of one node's link: channel, sender's rule, modes, and estimate fed back."""
             feed_back = None if group.reference_filter is None else _get_initial_mean(group.reference_filter)
             outputs = len(first(group.sensor).outputs)
             sender = None if group.trigger is None else group.trigger.start(outputs)
@@ -144,10 +144,16 @@ class SeparateChannels(AbstractMedium):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, Measurements]:
-        """Measure x at each node, and deliver what it sends through its channel; arguments and results as above."""
+        """Return the links' next states, and what each node receives of its measurement of x through its own channel.
+
+        Arguments and results as of `AbstractMedium`.
+        """
 
         def receive_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> tuple[PyTree, jax.Array]:
-            """Return the links of one group after the step, and what its nodes receive."""
+            """Return the state of the links of one group of nodes after the step, and what its nodes receive.
+
+            x: the plant's state, u: its inputs; a node without a sensor receives no numbers.
+            """
             if isinstance(group, NodesWithoutSensor):
                 return link, jnp.zeros((group.count, 0))
             transmit = map_all(lambda node, state: _transmit(node, state, x, u, key, k), len(group.checksums))
@@ -157,10 +163,16 @@ class SeparateChannels(AbstractMedium):
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
     def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
-        """Return the state with the present estimate of each filter that is fed back to its sensor."""
+        """Return the links' state with the present estimate of each filter that is fed back to its sensor.
+
+        `estimates`: of the nodes' filters by kind, (filter, node, ...).
+        """
 
         def feed_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> PyTree:
-            """Return the links of one group with their filters' estimates."""
+            """Return the links of one group of nodes with the estimates that are fed back to their senders.
+
+            `informed_at`: (kind, filter) whose estimates these are, None of groups without.
+            """
             if group.informed_at is None:
                 return link
             kind, f = group.informed_at
@@ -212,7 +224,10 @@ def _transmit(
 def _send_through_channel(
     group: NodeGroup, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, PyTree]:
-    """Send y, or its words, through the channel: return what was sent, what is received, and the channel's memory."""
+    """Return what was sent of y, what is received of it, and the channel's memory after step k.
+
+    An encoder sends words of few bits, carried by numbers of which the reader makes words again.
+    """
     if group.encoder is None or group.reader is None:
         memory, z = deliver_signal(group.channel, memory, y, key, k, group.checksums, group.memories)
         return y, z, memory
@@ -245,7 +260,10 @@ class CommonChannel(AbstractMedium):
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
     ) -> tuple[PyTree, Measurements]:
-        """Measure x and deliver to all nodes through the channel; arguments and results as of `AbstractMedium`."""
+        """Return the channel's next state, and what each node receives through the one channel of all, by group.
+
+        Each gets rows of its own (`rows`). Arguments as of `AbstractMedium`.
+        """
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))
         state, z = deliver_signal(self.channel, state, y, key, k, source, ())

@@ -58,7 +58,7 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-        """Draw the channel, h = [G n; 0 1], and send row k."""
+        """Return the channel's next state, and what arrives of y in row k; h = [G n; 0 1] is the channel as drawn."""
         k, y_k = row
         missing = jnp.isnan(y_k)
         state, h = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
@@ -110,7 +110,8 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
 def _separate_delays(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (steps, m) of what a node received, and the delay of each (steps,), NaN where it is lost.
 
-    A time stamp is the last number of each row of z, and is taken off.
+    In steps: 0 without a delay, the link's where it is constant, else the time stamp, which is the last number of each
+    row of z and is taken off.
     """
     channel = node.channel if isinstance(node, Node) else None
     link = first(channel)

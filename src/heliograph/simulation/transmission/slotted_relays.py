@@ -45,7 +45,7 @@ class SlottedRelays(AbstractMedium):
     memories: dict[str, np.ndarray]
 
     def init(self, key: jax.Array) -> RelayStates:
-        """Return the initial mean as every relay's estimate, and the hops' initial states."""
+        """Return the initial mean as every relay's estimate, and the initial states of the hops with memory."""
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
             name: start_channel(hop.channel, key, hop.source, self.memories[name])
@@ -106,7 +106,7 @@ class SlottedRelays(AbstractMedium):
     def _make_branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
         """Return the function that computes what each listener receives in one of these slots, of one structure.
 
-        A slot: by listener, its hop from each sender.
+        A slot: by listener, its hop from each sender. Hops with memory are added elsewhere.
         """
         # A single slot is not stacked: its hops may vary over time, and are read at the step.
         stacked: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
@@ -114,7 +114,10 @@ class SlottedRelays(AbstractMedium):
         def branch(
             position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
         ) -> dict[str, jax.Array]:
-            """Return what each listener receives, by name, in the slot at this position."""
+            """Return what each listener receives at step k, by name, in the slot at this position of the stack.
+
+            `sent`: signal of each sender, `key`: of the run.
+            """
             slot: PyTree = at(stacked, position) if isinstance(stacked, OverTime) else stacked
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
             return {name: _receive_sum(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
@@ -137,7 +140,10 @@ class SlotHop(NamedTuple):
 
 
 def find_hops_with_memory(relays: RelayNetwork) -> dict[str, SlotHop]:
-    """Return the hops whose channels have memory, by a name of slot, listener and sender."""
+    """Return the hops whose channels have memory, by a name of slot, listener and sender.
+
+    In each slot of a step, listeners have hops from those who send to them.
+    """
     return {
         f"{number} {listener} {sender}": SlotHop(number, listener, sender, hop)
         for number, slot in enumerate(relays.slots)
@@ -162,7 +168,7 @@ def _receive_sum(
     """
     parts = []
     for sender, hop in hops.items():
-        if not first(hop).remembers:
+        if not first(hop).remembers:  # its state is ()
             _, z = deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())
             parts.append(z)
     if parts:
