@@ -102,7 +102,7 @@ def read_bag(
 def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
     """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
 
-    `counts`: messages of the bag by topic.
+    `counts`: messages of the bag by topic. Topics of sources with a wildcard, + or #, are never said to be missing.
     """
     others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
     if others:
@@ -283,7 +283,10 @@ def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) 
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
-    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list."""
+    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list.
+
+    `fields`: type of each field by its path; that of a list is "list", and what is in it is not looked up.
+    """
     lists = [name for name, kind in fields.items() if kind == "list"]
     return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
         path.startswith(f"{name}.") for name in lists
@@ -317,7 +320,10 @@ def is_mcap_cut_off(path: Path) -> bool:
 
 
 def find_end_of_whole_records(path: Path) -> int:
-    """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
+    """Return the number of bytes of an MCAP file up to the end of its last whole record of data.
+
+    MAGIC is what the file begins with; a record of kind DATA_END or FOOTER follows the data.
+    """
     size, end = path.stat().st_size, len(MAGIC)
     # A record: a byte for its kind, eight for the length of its content, and this.
     head = struct.Struct("<BQ")
@@ -333,7 +339,10 @@ def find_end_of_whole_records(path: Path) -> int:
 
 @contextmanager
 def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it."""
+    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it.
+
+    ENDING is what every whole file ends with, which a file that was cut off lacks; BLOCK bytes are copied at a time.
+    """
     end = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name

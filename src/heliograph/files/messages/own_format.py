@@ -58,6 +58,7 @@ class OwnMessageCollector:
     """
 
     def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
+        """Begin with no message; `source`: what is read, for errors; `table`: whether messages are rows of a table."""
         self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
@@ -221,7 +222,8 @@ class OwnMessageReader:
     def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
         """Return a time that is a number; raise ValueError where it `is_step` and not a whole number from 0.
 
-        Where the first whole number is too large for a double, as of nanoseconds, all are counted from that one.
+        Where the first whole number is too large for a double (EXACT, 2^53), as of nanoseconds, all are counted from
+        that one, `self.zero`; `self.rounded` is the first time whose difference from it a double does not hold either.
         """
         number = _parse_number(cell, name)
         if isinstance(cell, int):
@@ -264,7 +266,7 @@ def _list_cell_items(cell: Any) -> list[Any]:
 
 
 def _parse_whole_number(cell: Any, name: str) -> int:
-    """Return a count with every digit; a float is accepted if it is an exact integer."""
+    """Return a count with every digit; a float is accepted if it is an exact integer, below EXACT (2^53)."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))
     if not isinstance(cell, int):

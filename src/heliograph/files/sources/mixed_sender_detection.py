@@ -17,6 +17,7 @@ class SenderCounter:
     """Counts the values of fields that are named as a sender's name is, in messages read as one node of one plant."""
 
     def __init__(self) -> None:
+        """Begin with no message; counts are of values by (topic, plant, node, field)."""
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
         self._names: dict[str, bool] = {}
         self._noted, self._said = 0, set[tuple[str, str]]()
@@ -24,7 +25,8 @@ class SenderCounter:
     def note_fields(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Count the fields of a message that was read as one of a node of a plant.
 
-        Fields that are `asked` for by a source tell senders apart already, or are values.
+        Only fields whose names may name a sender count, and no more than MANY of their values: several tell that
+        messages of several senders are mixed. Fields `asked` for by a source tell senders apart already, or are values.
         """
         self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
