@@ -68,8 +68,8 @@ def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilt
 def _can_be_joined(node: Node) -> bool:
     """Return whether a filter of several nodes can take this one in.
 
-    Its sensor and link do not change over time, messages come whenever they are due, as they were measured, and a
-    filter of its own claims a covariance and weighs nothing.
+    Its sensor and link do not change over time, messages come whenever they are due, as they were measured (without an
+    encoder), and a filter of its own claims a covariance. No such filter may weigh values by how likely they are.
     """
     fixed = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
     sent = node.trigger is None or isinstance(node.trigger, Periodic)

@@ -171,7 +171,8 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
 
 
 def weighs(filter: AbstractFilter) -> bool:
-    """Return whether a filter weighs the components of what arrives."""
+    """Return whether a filter weighs the components of what arrives by how likely they are, as one against outliers."""
+    # Only the shape of a correction is looked at, nothing is computed: without weighing its weight is None.
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
         innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
@@ -282,6 +283,7 @@ class RecentInnovations:
     """
 
     def __init__(self, rows: int, names: Mapping[tuple[str, str], Sequence[str]]):
+        """Begin with no row; `rows`: how many newest ones are kept; `names`: of outputs, by node and filter."""
         self.names = names
         self._rows: dict[tuple[str, str], deque[np.ndarray]] = defaultdict(lambda: deque(maxlen=rows))
         self.left_out = Counter[tuple[str, str]]()  # by node and filter: numbers of weight 0, of all rows so far
@@ -309,6 +311,7 @@ class RecentInnovations:
 
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
+    # Without inputs (the empty array): the record has these filters' innovations, so that none is run again.
     outputs: list[OutputHealth] = []
     for listener in yield_filters_with_measurements(network, record):
         if listener.name in record.weighed.get(listener.node, {}):
