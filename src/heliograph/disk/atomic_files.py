@@ -218,7 +218,7 @@ def check_folder_writable(folder: str | Path) -> None:
 
 
 def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    """Return the extension of a file name in lower case, which determines the format; ValueError unless in `formats`."""
+    """Return the extension of a file name in lower case, which determines the format; ValueError at an unknown one."""
     kind = path.suffix.lower()
     if kind not in formats:
         raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))

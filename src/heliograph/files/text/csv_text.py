@@ -50,7 +50,7 @@ class CsvReader:
     """
 
     def __init__(self, source: str, path: Path | None, marked: bool):
-        """Begin with no line and no header; `marked`: whether rows may begin with #, as cells and not as comments."""
+        """Begin with no line and no header; `marked`: whether a name or a cell may begin with #, and is no comment."""
         self.source, self.path, self._marked = source, path, marked
         self.header: list[str] = []
         self.number = 0
