@@ -54,7 +54,10 @@ class StateScore:
 def list_state_scores(
     store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]
 ) -> list[StateScore]:
-    """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
+    """Return the scores of every state of every filter in these settings: over all steps (0), then at each of `steps`.
+
+    Of the chunks (runs of a setting) that the store has.
+    """
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)
     results: list[StateScore] = []

@@ -126,7 +126,7 @@ def _build_network(campaign: str, setting: int) -> Network:
     plan = parse_campaign(campaign)
     network = plan.function()(**plan.settings[setting])
     network.check_horizon(plan.horizon)
-    make_network_inputs(plan, network)
+    make_network_inputs(plan, network)  # raises where the campaign has other inputs
     _drop_old_programs(network)
     return network
 

@@ -53,7 +53,10 @@ for single, arguments in COMMANDS.items():
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
+
+    `stopped`: signals that came; what a signal ended has the code SIGNALLED, 128, plus its number.
+    """
     stopped: list[int] = []
     try:
         with unwind_on_signals(stopped):

@@ -226,7 +226,10 @@ def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
 
 
 def check_replaceable(target: Path, mark: str) -> None:
-    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results."""
+    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results.
+
+    A lock file, LOCK, counts as nothing. Folders that killed processes left beside it are removed first.
+    """
     check_folder_writable(target)
     remove_leftover_folders(target)
     if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():

@@ -101,7 +101,7 @@ class NodeEvents:
     ) -> None:
         """Write how many messages were lost before each event into the last column of the node's `table`.
 
-        The running counts say it, of the events in `rows`, in order of time, whose messages do not have the number.
+        Only where a message does not say it (NaN), by the running `counts` of the events, in order of time, in `rows`.
         """
         gaps = np.diff(counts, prepend=counts[:1]) - 1.0
         gaps[gaps < 0] = np.nan  # the first, and after a restart
@@ -278,7 +278,7 @@ def _judge_repeated_events(
 def count_verdicts(
     node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
 ) -> dict[int, dict[Verdict, int]]:
-    """Return {number of a node: {verdict: how many of its events have it}}; both arrays have one for each event."""
+    """Return {number of a node: {verdict: how many of its events have it}}; `verdicts`: of each event by its index."""
     return {
         int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
         for n in np.unique(node)
@@ -344,7 +344,7 @@ def node_counts_losses(network: Network, name: str) -> bool:
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
-    return node.trigger.side_information(len(node.outputs)) == 1
+    return node.trigger.side_information(len(node.outputs)) == 1  # how many numbers on losses come with the values
 
 
 def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndarray, " events"], np.ndarray]:

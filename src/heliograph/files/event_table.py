@@ -155,7 +155,7 @@ class EventTable:
         return counts
 
     def refuse(self, error: InputError, strict: bool) -> None:
-        """Count a message that cannot be read, with the reason.
+        """Count a message that cannot be read, and keep the reasons of the first three.
 
         Raises:
             ValueError: this error, where reading is strict.

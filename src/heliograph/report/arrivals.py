@@ -301,7 +301,7 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change.
 
-    None too where the sender decides when to send.
+    None too of a link that loses nothing, and where the sender decides when to send.
     """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

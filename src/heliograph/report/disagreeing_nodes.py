@@ -55,6 +55,7 @@ def find_constant_error_between_nodes(
 
 def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilter | None:
     """Return a filter of what all these nodes receive; None behind a link for which no such filter is made."""
+    # What was lost is NaN in the data: the links need to say only how what arrives is changed.
     links = [x.channel.condition_on_arrival() for x in nodes.values() if not isinstance(x.channel, OverTime)]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
     is_linear = isinstance(network.plant, LinearPlant) and isinstance(sensor, LinearSensor)

@@ -21,7 +21,7 @@ class Advance(Protocol):
 
 @contextmanager
 def _show_bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
-    """Show a bar on stderr with the current stage and `more` columns in the block; nothing without a terminal."""
+    """Show a bar on stderr with the current stage and `more` columns, in this context; nothing without a terminal."""
     console = rich.console.Console(stderr=True)
     columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

@@ -213,7 +213,10 @@ class Health:
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
     def explains_all_innovations(self, health: FilterHealth, off: ConstantError) -> bool:
-        """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
+        """Return whether innovations without the effect of a constant error are as large as claimed, without memory.
+
+        `off.squares`: these squared, over their variances, NaN where none came; `off.white`: they, over deviations.
+        """
         level = self._level_of_one_test() / off.squares.shape[1]
         for column in off.squares.T:
             numbers = int(np.count_nonzero(~np.isnan(column)))
@@ -227,7 +230,8 @@ class Health:
 
         Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
         """
-        # A filter's gains suit the mean over all runs: in a run that is far from it they are too large or too small.
+        # A filter's gains suit the mean over all runs: in a run whose mean square innovation, relative to that over all
+        # runs (`expected`), is further from 1 than TYPICAL they are too large or too small.
         if abs(np.log(health.expected)) > np.log(TYPICAL):
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0

@@ -44,6 +44,7 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
     others are empty for ever (frac is the part after the point). If it is hardly slower than the rows the empty ones
     are rare, and have a rate themselves: one of each 1 / (1 - 1 / T) rows, and no such slot without its empty row.
+    `slots`: of each arrival its number among those that were due.
     """
     rate = _find_slowest_rate(arrived)
     if rate is not None:

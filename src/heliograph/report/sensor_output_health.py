@@ -162,6 +162,7 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
     """
     # Names of the filters whose estimates a fusion joins, in a centre or among neighbours.
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
+    # STRENGTH orders claims, from "none" to "exact".
     relied_on = {}
     for node, receiver in network.nodes.items():
         strengths = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}

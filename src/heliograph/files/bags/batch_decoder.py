@@ -249,7 +249,8 @@ def _list_paths_of_numbers(source: Source) -> list[str]:
     """Return dotted paths of the numbers that a source needs: its values, both parts of a stamp, its running count.
 
     Raises:
-        LayoutNotFixedError: plant or node are read from the message, or values are chosen by one: each is read alone.
+        LayoutNotFixedError: a source of which each message is decoded alone, since its plant or node stand in the
+            message, a condition (`where`) chooses messages, or times are steps.
     """
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutNotFixedError

@@ -136,7 +136,10 @@ def _load_ros2_message_types() -> Any:
 
 
 def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
-    """Return times in nanoseconds since 1970: of dates, or of seconds from an origin (None: 1970); a step is one."""
+    """Return times in nanoseconds since 1970: of dates, or of seconds from an origin (None: 1970).
+
+    Times that are steps are taken as seconds.
+    """
     if time.dtype.kind == "M":
         return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
     begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
@@ -217,7 +220,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
 
 
 def _yield_state_numbers(estimates: _FilterEstimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
-    """Yield topic and number of each state in row k: its mean, and its deviation if the filter claims one."""
+    """Yield topic and number of each state in row k: its mean, and its standard deviation if the filter claims one."""
     for i, state in enumerate(states):
         topic = f"{estimates.prefix}/{_make_valid_topic_word(state)}"
         yield topic, float(estimates.mean[k, i])
@@ -283,6 +286,7 @@ def _select_pose_and_covariance(
 
 def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
+    # Sines and cosines of half the angles.
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (
         sr * cp * cy - cr * sp * sy,

@@ -187,7 +187,7 @@ def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
     for kind, content in records:
         if kind == SCHEMA:
             types |= _read_protobuf_schemas(content)
-        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []
+        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []  # [0] is its number
     return channels
 
 

@@ -244,7 +244,7 @@ def _append_messages(
 
 
 def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
-    """Yield dotted path and basic type of the fields of a message type; lists and what is in them are left out.
+    """Yield dotted path and basic type of the fields of a message type; a list has the type "list", its items none.
 
     A type that the bag does not define has no fields.
     """
@@ -310,7 +310,7 @@ def _format_topic_counts(counts: dict[str, int]) -> str:
 
 
 def is_mcap_cut_off(path: Path) -> bool:
-    """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
+    """Return whether a file begins as MCAP and does not end as MCAP does, with MAGIC too: it was cut off."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False
     with path.open("rb") as file:

@@ -126,6 +126,7 @@ def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     """Return the message of a row of a table.
 
     Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
+    Beside a payload columns such as `time` say when it was logged; without one they are fields of the message.
     """
     arrival = find_arrival_time(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:

@@ -103,7 +103,7 @@ class OwnMessageCollector:
 
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and one of the inputs that it brings."""
-        found = self._reader.read(message.where, message.content)
+        found = self._reader.read(message.where, message.content)  # readings, or why there is none, and arrivals
         if self._table is None:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
         for reading, arrival in found:
@@ -134,7 +134,11 @@ class OwnMessageReader:
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
-        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns."""
+        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns.
+
+        `components`: names of each node's values; `numbers`: whether times are numbers and no dates, None before any;
+        `zero` and `rounded`: what large whole times count from, and the first that a double does not hold.
+        """
         self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)

@@ -139,7 +139,10 @@ class Geodetic:
     metres: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none."""
+        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none.
+
+        `degrees` and `metres`: how many of these one unit of the message's numbers is, above 0 (TINY or more).
+        """
         instance("Geodetic, plane", self.plane, LocalPlane, "a hg.models.LocalPlane")
         for name in ("latitude", "longitude", "height"):
             path = getattr(self, name)

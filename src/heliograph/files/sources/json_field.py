@@ -309,7 +309,7 @@ def json_field(
 
 
 def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[Stamp | None, float | None]":
-    """Return the stamp of a source and the seconds of its steps, None where it has none; raise ValueError at others."""
+    """Return stamp and seconds of a step of a source, None where it has none; ValueError if options contradict."""
     if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
         raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
     stamp = Stamp(time) if isinstance(time, str) else time
