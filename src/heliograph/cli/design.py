@@ -36,7 +36,7 @@ def design(
     file = read_design(task)
 
     def results_of(designed: "DesignResults") -> "ResultsContent":
-        """Return the content of the results folder."""
+        """Return the content of the results folder of a design: figures, page, summary and networks."""
         from heliograph.report.pages.design import make_design_results
 
         return make_design_results(designed)

@@ -214,7 +214,7 @@ class MergedBlockWarnings:
     """Lines on blocks of rows: those that differ in their numbers alone are one, of the first block that has it."""
 
     def __init__(self) -> None:
-        """Begin with no block and no line."""
+        """Begin with no block and no line; `_more`: in how many later blocks a line came again."""
         self._blocks = 0
         self._first = dict[str, tuple[str, str]]()  # by the line without its numbers: rows, line
         self._more = Counter[str]()
@@ -235,7 +235,10 @@ class MergedBlockWarnings:
             here.add(kind)
 
     def list_lines(self) -> list[str]:
-        """Return the lines, which name the rows of their block if there are several."""
+        """Return the lines, which name the rows of their block if there are several blocks.
+
+        `self._first`: by the line without its numbers the first one, with the rows of its block.
+        """
         if self._blocks == 1:
             return [line for _, line in self._first.values()]
         return [

@@ -99,7 +99,10 @@ class GentleStop:
             raise KeyboardInterrupt
 
     def run_unless_stopped(self, work: Callable[[], T]) -> T | None:
-        """Return the value of work that may be left out, None if a signal (`self._number`) came before its end."""
+        """Return the value of work that may be left out, None if a signal (`self._number`) came before its end.
+
+        Within it a signal raises KeyboardInterrupt, which is another's where no signal was noted.
+        """
         if self._number:
             return None
         try:
@@ -122,7 +125,7 @@ class GentleStop:
         self._restore_handlers()
 
     def _restore_handlers(self) -> None:
-        """Give signals the handlers back that they had before `note_next_signal_only`."""
+        """Give signals the handlers (`self._handlers`) back that they had before `note_next_signal_only`."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._handlers = {}

@@ -73,7 +73,8 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
         """Return the arrays of the state, the estimate and two flags after step k, with measurement z and input u.
 
-        The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`.
+        The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`, of which
+        ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
         """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
         implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)

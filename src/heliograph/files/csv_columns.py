@@ -76,7 +76,7 @@ class CsvColumnReader:
         self.source, self.path, self._only, self._strict = source, path, only, strict
         self.header: list[str] = []
         self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
-        self._zoned = dict[str, bool]()  # whether these have a zone
+        self._zoned = dict[str, bool]()  # by column of dates whether these have a zone
 
     def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
         """Return the rows that can be read, as columns; why the others cannot.

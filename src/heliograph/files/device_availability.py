@@ -85,7 +85,11 @@ class DeviceStatuses:
     """
 
     def __init__(self, conditions: Iterable[Available]):
-        """Begin with no word, online or offline, of any device; `conditions`: topics and words by which they say it."""
+        """Begin with no word, online or offline, of any device; `conditions`: topics and words by which they say it.
+
+        `_offline`: conditions, with the topic, of which the last word was offline; `_heard`: those that had any word;
+        `_changed`: topics with a new word.
+        """
         self._by_pattern: dict[str, list[Available]] = {}
         for condition in dict.fromkeys(conditions):
             self._by_pattern.setdefault(condition.topic, []).append(condition)

@@ -76,7 +76,7 @@ class EventTable:
         return list(self._plants)
 
     def of(self, plant: str) -> "EventTable":
-        """Return the events of one plant.
+        """Return the events of one plant, as a table that shares its columns with this one.
 
         Args:
             plant: its name.
@@ -241,7 +241,7 @@ class EventTable:
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
-        """Return by node that has events the seconds from measuring to logging of each, in order of their times."""
+        """Return by node with events how long each took to be logged, in seconds or time's unit, in order of time."""
         results, second = {}, 1 if self.numbers else SECOND
         for name in () if self._times_are_steps else self.network.names:
             time, arrival, _ = self.columns[name].arrays()
@@ -389,7 +389,7 @@ class EventTable:
         return events._replace(time=time, arrival=arrival)
 
     def _judge_events(self, window: float, ahead: float) -> tuple[EventsByArrival, Int[np.ndarray, " events"]]:
-        """Return the events in order of arrival, and what a timeline with this window would do with each."""
+        """Return the events in order of arrival, and what a timeline with these limits would do with each."""
         events, matrices = self._sort_by_arrival(), self._list_value_matrices()
 
         def values(i: int) -> np.ndarray:

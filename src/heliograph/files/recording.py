@@ -157,7 +157,7 @@ class RowReader:
     def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
         """Begin with no row; where `strict`, the first that cannot be read is an error, else it is refused alone."""
         self.network, self.source, self._strict = network, source, strict
-        self._headers = _map_headers(network)
+        self._headers = _map_headers(network)  # {header that a column may have: its name}
         self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
         self.refused = list[InputError]()
         self._behind = 0  # rows that came after later ones

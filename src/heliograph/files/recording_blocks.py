@@ -54,6 +54,7 @@ class RecordingBlocks:
         self._reader = RowReader(network, str(path), strict, ignore_unknown)
         self._last_number = 0  # of the rows read so far, refused ones included
         self._done, self._total = 0, 0  # how much of the file is read, and of how much, as progress has it
+        # Rows refused, with the first reasons; rows yielded; warnings.
         self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
 
     @property

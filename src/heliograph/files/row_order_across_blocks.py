@@ -35,7 +35,10 @@ class BlockOrderCheck:
     """
 
     def __init__(self, path: Path, network: Network):
-        """Begin with no row; rows are steps where the network has no input dt. `last`: the newest row that stays."""
+        """Begin with no row; rows are steps where the network has no input dt.
+
+        `_first` and `last`: the first row that stays of all blocks, and the newest.
+        """
         self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
         self.last: RecordingRows | None = None
         self._first: RecordingRows | None = None

@@ -349,7 +349,10 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
 
 
 def _rank_field(path: str) -> int:
-    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1."""
+    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1.
+
+    HOUSEKEEPING matches words of the latter, such as a battery's; PAYLOADS are names of what holds measurements.
+    """
     words = path.lower().split(".")
     if any(HOUSEKEEPING.fullmatch(word) for word in words):
         return 2

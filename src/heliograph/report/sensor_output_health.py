@@ -293,7 +293,7 @@ class RecentInnovations:
         """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
         row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
-        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])
+        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])  # None, not arrived, is not 0
 
     def summarise_outputs(self) -> list[OutputHealth]:
         """Return what the newest rows of each filter say of each of its outputs."""

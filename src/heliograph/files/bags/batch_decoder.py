@@ -54,7 +54,9 @@ class MessageLayout:
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
         """Find where the fields at `paths` stand in messages laid out as `data`; LayoutNotFixedError if one cannot be.
 
-        `definitions`: fields of each type of messages; `kind`: type of this one.
+        `definitions`: fields of each type of messages; `kind`: type of this one. `self.lengths` gets the length of each
+        text or list by the byte where it stands, in byte 0 what must be the HEAD of the encoding; `self.fields` gets
+        by path the byte of a wanted number and its type.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()

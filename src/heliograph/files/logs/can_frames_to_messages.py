@@ -103,7 +103,7 @@ class FrameReader:
         self._note_left_out()
 
     def _note_left_out(self) -> None:
-        """Append a line on the frames that were left out, and one on those longer than the database has them."""
+        """Append a line on frames that were left out, by kind, and one on those longer than the database has them."""
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
             self._notes.append(f"{self._path}: frames left out: {counts}")

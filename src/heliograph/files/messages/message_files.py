@@ -71,7 +71,8 @@ def read_parquet_names(path: Path) -> list[str]:
 def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, or why one cannot be read, in the order of the file.
 
-    Where the file is damaged or cut off the last is a `CutOffError`.
+    Where the file is damaged or cut off the last is a `CutOffError`. Files with an extension of LINES have JSON or
+    what MQTT clients print, others are CSV or Parquet.
 
     Raises:
         ValueError: the file cannot be read at all; one line.

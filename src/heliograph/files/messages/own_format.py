@@ -58,7 +58,10 @@ class OwnMessageCollector:
     """
 
     def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
-        """Begin with no message; `source`: what is read, for errors; `table`: whether messages are rows of a table."""
+        """Begin with no message; `source`: what is read, for errors; `table`: whether messages are rows of a table.
+
+        Counted are messages used and refused; `reasons`: of the first refused; `broken`: where the file was cut off.
+        """
         self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""

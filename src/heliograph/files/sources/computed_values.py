@@ -77,7 +77,7 @@ class Covariance:
         # As messages of ROS say it, nothing is known where the first entry is -1, or where all variances are 0.
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
-        # Entries ij and ji that differ are no covariance.
+        # Entries ij and ji that differ by more than rounding (SYMMETRIC, in deviations) are no covariance.
         deviations = np.sqrt(np.abs(np.asarray(row_variance) * column_variance))
         known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * deviations
         # The kind of the covariance, where the message has one: 0 is unknown.

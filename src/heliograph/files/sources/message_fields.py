@@ -166,7 +166,7 @@ def _make_attribute_getter(path: str) -> "attrgetter[Any]":
 def convert_number(value: Any, name: str, quoted: bool = False) -> float:
     """Return a value as a double; NaN for null, for words of that meaning, and for what is not finite.
 
-    A text of a number is one only where it may be `quoted`.
+    A text of a number is one only where it may be `quoted`. NO_VALUE matches words as "null"; `name`: for errors.
     """
     if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
         return np.nan

@@ -71,7 +71,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
     """
     try:
         with path.open("rb") as file, _open_unpacked(file) as unpacked:
-            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))
+            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))  # by as many bytes as the mark of UTF-16 has
             errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
             with TextIOWrapper(unpacked, newline="", encoding=encoding, errors=errors) as text:
                 yield text

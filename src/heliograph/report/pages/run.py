@@ -65,7 +65,7 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
-        """Write the results of each plant into a folder of its own."""
+        """Write the results of each plant of `examined` into a folder of its own, named as `folders` has it."""
         for plant, health in examined.items():
             subfolder = folder / folders[plant]
             subfolder.mkdir()
