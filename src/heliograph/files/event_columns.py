@@ -312,7 +312,7 @@ def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
 
 def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
     """Return the rank of each row by these columns, the first of which matters most; equal rows have the same rank."""
-    order = np.lexsort(columns[::-1])
+    order = np.lexsort(columns[::-1])  # which takes the one that matters most last
     new = np.zeros(len(order), dtype=bool)
     for column in columns:
         new[1:] |= column[order][1:] != column[order][:-1]

@@ -61,7 +61,7 @@ class Arrivals:
 
     @cached_property
     def rate(self) -> SendingRate | None:
-        """The mean rate of a sender whose clock is not that of the rows; None where a pattern of rows explains as much.
+        """Return the rate of a sender whose clock is not that of the rows; None where a pattern of rows does as well.
 
         A pattern is due in the same few of each so many rows; `arrived`: whether a message came in each row. None too
         where the sender's period is declared, and where rows are there because messages are. Of rate and pattern the
@@ -137,7 +137,7 @@ class Arrivals:
 
     @property
     def due_in(self) -> str:
-        """The rows or times in which it is due, in words: each slot (a row, or a period), or those of a pattern."""
+        """Return in words the rows or times in which it is due: each slot (a row, or a period), or a pattern's."""
         if self.slots is None:
             return "not known"
         some = "" if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
@@ -181,7 +181,7 @@ class Arrivals:
         return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
 
     def contradicts(self, level: float) -> bool:
-        """Test at a level whether the share that arrived is another than the stated one, and by more than a hundredth.
+        """Return whether, tested at a level, the share that arrived is not the stated one, by more than a hundredth.
 
         Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a) with the correlation a
         of each with the next.
@@ -196,7 +196,7 @@ class Arrivals:
 
     @property
     def longest_gap(self) -> int | None:
-        """Greatest number of messages in a row that were due and did not arrive; None where nobody knows."""
+        """Return the most messages in a row that were due and did not arrive; None where nobody knows what was due."""
         if self.due_slots is None:
             return None
         # As if a message had come before the first and after the last.

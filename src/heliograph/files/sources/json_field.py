@@ -369,7 +369,7 @@ def _read_valid_flags(valid: object) -> Allowed:
         return {valid: (True, 1)}
     if not isinstance(valid, Mapping | None):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
-    return _split_conditions(valid)[0]
+    return _split_conditions(valid)[0]  # those on fields of the message
 
 
 def read_texts(name: str, value: object) -> tuple[str, ...]:
