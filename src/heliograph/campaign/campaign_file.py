@@ -122,7 +122,7 @@ def _read_positive_integer(table: Mapping[str, object], key: str, name: str) -> 
 
 
 def _read_chunk_size(value: object, name: str) -> int:
-    """Return the runs of a chunk, a multiple of those simulated side by side."""
+    """Return the number of runs of a chunk, a multiple of BLOCK, those simulated side by side; `name`: of the file."""
     count = check_count(f"{name}, chunk", value)
     if count % BLOCK:
         raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", count)
@@ -137,7 +137,7 @@ def _read_timeout(value: object, name: str) -> float:
 
 
 def _read_choice(value: object, choices: Sequence[str], name: str) -> str:
-    """Return a value that is one of the choices."""
+    """Return a value that is one of the choices; raise ValueError at another, which calls it `name`."""
     if value not in choices:
         raise fail(name, " or ".join(map(repr, choices)), repr(value))
     return str(value)
@@ -190,7 +190,7 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
 
 
 def _expand_grid(grid: object, name: str) -> list[Setting]:
-    """Return every combination of the values of [grid]."""
+    """Return every combination of the values that the table [grid] lists for each parameter, one setting each."""
     if not isinstance(grid, dict) or not grid:
         raise fail(f"{name}, grid", "a table of lists of values by parameter", _format_value_for_error(grid))
     for key, values in grid.items():

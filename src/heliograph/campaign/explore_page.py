@@ -54,7 +54,10 @@ class StateScore:
 def list_state_scores(
     store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]
 ) -> list[StateScore]:
-    """Return the scores of every state of every filter in these settings: over all steps, then at each given step."""
+    """Return the scores of every state of every filter in these settings: over all steps (0), then at each of `steps`.
+
+    Of the chunks (runs of a setting) that the store has.
+    """
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)
     results: list[StateScore] = []
@@ -81,7 +84,9 @@ class ErrorSums(NamedTuple):
 
 
 def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray, steps: Sequence[int]) -> ErrorSums:
-    """Return the sums over those of some runs that are finite.
+    """Return how many of some runs are finite, and sums over them of squared errors, variances and their ratios.
+
+    Sums of their squares too, by which standard errors are found.
 
     Args:
         group: the store, with errors and variances (setting, run, step, node, filter, state).
@@ -234,7 +239,7 @@ def _describe_shown_part(settings: int, campaign: Campaign, shown: Sequence[Scor
 
 
 def _keep_first_settings(scores: Sequence[Score]) -> list[Score]:
-    """Return the scores of the first settings, each setting as a whole: as many as a page shows."""
+    """Return the scores of the first settings, each setting as a whole: at most ROWS, but those of one at least."""
     shown: list[Score] = []
     for _, of_setting in groupby(scores, key=lambda score: score.setting):
         rows = list(of_setting)
@@ -303,7 +308,10 @@ def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explor
 
 
 def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
-    """Return the table of scores step by step, and how it is drawn at first."""
+    """Return the table of scores step by step, and how it is drawn at first: over time, a panel for each state.
+
+    `whole`: columns of which all values are shown at first; `unordered`: one along which points are not connected.
+    """
     steps: dict[str, list[Value]] = {"time": [row.step for row in rows]}
     return ExploredTable(
         "step by step",
@@ -319,7 +327,10 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
-    """Return the columns of a table: settings, their parameters, names, and these fields of the scores, row by row."""
+    """Return the columns of a table: settings, their parameters, NAMES (as of node and filter), and these fields.
+
+    Each has a value for each of `rows`, the scores.
+    """
     parameters = {name: list_parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
         "setting": [row.setting for row in rows],
@@ -329,7 +340,7 @@ def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequen
 
 
 def _choose_axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:
-    """Return the first numeric parameter with several values, else any with several, else the column "setting"."""
+    """Return the column for the axis: the first numeric parameter with several values, any with several, "setting"."""
     several = [name for name in parameters if len(set(columns[name])) > 1]
     numbers = [name for name in several if {type(value) for value in columns[name]} <= {int, float}]
     return next(iter([*numbers, *several]), "setting")

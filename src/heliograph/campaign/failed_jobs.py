@@ -43,6 +43,7 @@ def read_failures(out: Path) -> list[FailedJob]:
 
 def make_failed_job(campaign: Campaign, out: Path, job: Job, reply: Reply) -> FailedJob:
     """Return the failure of a job, with all that is needed to repeat it, from its last reply."""
+    # A job without a chunk builds the setting's network: its failure is one of all the setting's runs.
     chunks = campaign.chunks(job.setting)
     chunks = chunks if job.chunk is None else [chunks[job.chunk]]
     return FailedJob(

@@ -38,7 +38,8 @@ def start_engine(
 ) -> AbstractContextManager[Engine]:
     """Return the engine as a context: on the cluster of a scheduler, else in `workers` processes, or for 0 in this one.
 
-    `campaign` is JSON, `store` the folder of the results; a job may take `timeout` seconds.
+    An engine takes jobs and yields each with its reply. `campaign` is JSON, `store` the folder of the results; a job
+    may take `timeout` seconds, which nothing bounds in this process.
     """
     if scheduler is not None:
         return run_on_cluster(campaign, store, scheduler, timeout)
@@ -68,7 +69,7 @@ def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job
     count = len(waiting)
 
     def take_jobs(worker: _WorkerProcess) -> None:
-        """Take jobs and do them, until none waits or the worker is stopped."""
+        """Take jobs from `waiting`, put them with the worker's reply into `finished`, until none waits or it stops."""
         while not worker.stopped:
             try:
                 job = waiting.popleft()
@@ -86,6 +87,7 @@ class _WorkerProcess:
     """A worker process and the pipes to it: a job is a line of JSON, its reply another."""
 
     def __init__(self, campaign: str, store: Path, timeout: float):
+        """Begin without a process, which the first job starts; `timeout`: the seconds that a job may take."""
         self.greeting, self.timeout = json.dumps([campaign, str(store)]), timeout
         self.process: subprocess.Popen[str] | None = None
         self.stopped = False
@@ -241,7 +243,9 @@ def _run_jobs_on_cluster(
 
 
 def _wait_for_next_future(client: Untyped, futures: Untyped, timeout: float) -> Untyped:
-    """Return the next of the futures that is done; None after `timeout` seconds without one.
+    """Return the next of the futures (jobs on the cluster) that is done; None after `timeout` seconds without one.
+
+    It looks each LOOK seconds; LOST is what the error says.
 
     Raises:
         ValueError: the connection to the cluster is lost.
@@ -271,7 +275,7 @@ def _format_error(error: Exception) -> str:
 
 
 def _read_reply(future: Untyped) -> Reply:
-    """Return the reply of a job that is done, or one that says why it has none."""
+    """Return the reply of a job that is done, or a reply with the error by which it has none."""
     if future.status == "finished":
         reply: Reply = future.result()
         return reply

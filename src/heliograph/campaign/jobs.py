@@ -101,7 +101,10 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
 
 
 def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
-    """Return the network's inputs over the campaign's steps, (horizon, inputs)."""
+    """Return the network's inputs over the campaign's steps, (horizon, inputs); None of a network without any.
+
+    In the campaign each is a number for all steps, or a list of one for each.
+    """
     if sorted(campaign.inputs) != sorted(network.inputs):
         raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
     if not network.inputs:
@@ -123,7 +126,7 @@ def _build_network(campaign: str, setting: int) -> Network:
     plan = parse_campaign(campaign)
     network = plan.function()(**plan.settings[setting])
     network.check_horizon(plan.horizon)
-    make_network_inputs(plan, network)
+    make_network_inputs(plan, network)  # raises where the campaign has other inputs
     _drop_old_programs(network)
     return network
 
@@ -132,7 +135,10 @@ _seen: list[Network] = []
 
 
 def _drop_old_programs(network: Network) -> None:
-    """Drop all compiled programs once networks of `COMPILED` other structures have been seen before this one."""
+    """Drop all compiled programs once networks of COMPILED other structures have been seen before this one.
+
+    `_seen`: a network of each structure since the last time; networks of one structure share their programs.
+    """
     if any(have_same_structure(network, other) for other in _seen):
         return
     if len(_seen) == COMPILED:
@@ -184,7 +190,10 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
     world: bool = eqx.field(static=True, default=False)
 
     def of_step(self, step: PyTree) -> OfStep:
-        """Return the errors of one step, of each estimate; with `world` also truth and measurements."""
+        """Return the errors of one step, of each estimate; with `self.world` also truth and measurements.
+
+        `step`: true state, measurements, and estimates of nodes and of fusions (centres), each alike a tree.
+        """
         recorded = {
             kind: jax.tree.map(
                 lambda estimate: _measure_errors(step["truth"], estimate),
@@ -198,7 +207,10 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
         return OfStep(collected=recorded)
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
-        """Return the collected errors by node and filter, and with `world` truth and measurements."""
+        """Return the collected errors by node and filter, and with `self.world` truth and measurements.
+
+        Collected errors have axes (..., filter, node, state), so that filters are axis -3; NEES has none of states.
+        """
         results = {
             field: self.split_by_name(network, collected, itemgetter(field), axis)
             for field, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
@@ -214,7 +226,10 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
 
 
 def _measure_errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    """Return error (..., n), claimed variances (..., n) and NEES per state (...), of one estimate or of each step's."""
+    """Return error (..., n), claimed variances (..., n) and NEES per state (...) of an estimate of the true state.
+
+    NEES: the error squared over the claimed covariance, divided by the number of states.
+    """
     error, covariance = estimate.error(truth), jnp.asarray(estimate.covariance)
     variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
     nees = jnp.vectorize(squared_distance, signature="(n,n),(n)->()")(covariance, error)

@@ -84,7 +84,7 @@ def _describe_failures(failures: Sequence[FailedJob]) -> str:
 
 
 def _list_failures(failures: Sequence[FailedJob]) -> Section:
-    """Return the section that lists the jobs that failed, with their errors."""
+    """Return the section that lists the first REPORTED jobs that failed, with their errors, and how to repeat one."""
     points = [
         f"setting {failure.setting} {failure.parameters}, runs {failure.runs[0]} to {failure.runs[1]}: {failure.error}"
         for failure in failures[:REPORTED]
@@ -141,7 +141,7 @@ NEES = ScoreColumn("NEES per dimension", "nees_per_dimension", "nees_error")
 
 
 def draw_campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
-    """Return figures by name: RMSE and NEES for each numeric parameter, or else by setting."""
+    """Return figures by name: RMSE and NEES against each of at most PARAMETERS numeric parameters, else by setting."""
     parameters = [name for name in campaign.parameters if _can_be_axis(campaign, name)][:PARAMETERS]
     figures = {}
     for quantity in (RMSE, NEES):
@@ -193,7 +193,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
 
 
 def _group_into_panels(campaign: Campaign, scores: Sequence[Score], parameter: str) -> dict[str, list[Score]]:
-    """Return {title: scores} with those of one node and of equal parameters, but for this one, together."""
+    """Return {title of a panel: its scores}, those of one node whose settings differ in nothing but `parameter`."""
     panels: dict[str, list[Score]] = {}
     for score in scores:
         rest = _drop_parameter(campaign.settings[score.setting], parameter)
@@ -273,7 +273,7 @@ def _finish_figure(
 
 
 def _choose_axis_scale(axes: Axes, values: Sequence[float], axis: str) -> None:
-    """Make a shared axis logarithmic if its values span a large ratio."""
+    """Make a shared axis ("x" or "y") logarithmic if its values are positive and span a ratio above LOGARITHMIC."""
     finite = np.array([value for value in values if np.isfinite(value)])
     if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():
         axes.set_xscale("log") if axis == "x" else axes.set_yscale("log")

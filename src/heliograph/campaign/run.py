@@ -211,7 +211,7 @@ def _prepare_store(
     described: dict[int, NetworkDescription] = {}
 
     def accept(job: Job, value: NetworkDescription | None, done: int) -> None:
-        """Keep the description of a setting."""
+        """Keep the description of a job's setting in `described`, and show progress: `done` of all `jobs` are built."""
         assert value is not None  # these jobs only describe
         described[job.setting] = value
         progress("building", done, len(jobs))

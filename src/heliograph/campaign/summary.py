@@ -154,7 +154,7 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
 
 
 def _compute_mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean of independent values and its standard error; NaN of too few."""
+    """Return the mean of independent values and its standard error; NaN where there are none, or no two of them."""
     if not len(values):
         return np.nan, np.nan
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan

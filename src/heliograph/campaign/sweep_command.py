@@ -117,7 +117,10 @@ def show_campaign_progress(workers: int) -> Iterator[Progress]:
     with show_countdown(countdown) as show:
 
         def progress(what: str, done: int, total: int) -> None:
-            """Show how many chunks are done; at first also how many were there before."""
+            """Show how many chunks are done; while simulating note it for the time left, `countdown`.
+
+            At the first note, as `countdown.first` is None, also say how many chunks were there before.
+            """
             if what == "simulating":
                 if countdown.first is None and done:
                     print(f"{done} of {total} chunks are already there", file=sys.stderr)
@@ -130,7 +133,7 @@ def show_campaign_progress(workers: int) -> Iterator[Progress]:
 def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
     """Print the first ROWS rows of the table of scores: names to the left, numbers to the right."""
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    first_number = len(campaign.parameters) + 3
+    first_number = len(campaign.parameters) + 3  # behind the names of node, filter and claim
     for i, header in enumerate(make_score_headers(campaign)):
         side: Literal["left", "right"] = "right" if i >= first_number else "left"
         table.add_column(Text(fill(visible(header), 7)), overflow="fold", justify=side)

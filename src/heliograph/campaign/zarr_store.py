@@ -71,7 +71,10 @@ def restore_labels(table: LabelsAsJson) -> AxisLabels:
 
 
 def unite_labels(parts: Mapping[int, AxisLabels]) -> AxisLabels:
-    """Return the union of the labels of all settings, in order of first appearance."""
+    """Return the union of the labels (names of nodes and filters) of all settings, in order of first appearance.
+
+    `parts`: labels by setting. States have to be the same in all; `received`: components of the longest measurement.
+    """
     first, labels = next(iter(parts.items()))
     for setting, other in parts.items():
         if other.states != labels.states:
@@ -163,7 +166,10 @@ def _make_coordinates(campaign: Campaign, labels: AxisLabels) -> dict[str, np.nd
 
 
 def list_parameter_values(campaign: Campaign, name: str) -> np.ndarray:
-    """Return a parameter by setting: numbers or booleans where all values are, else text; NaN or "" if absent."""
+    """Return a parameter's value in each setting: numbers or booleans where all values are, else text.
+
+    Where a setting lacks it NaN of numbers, "" of text.
+    """
     values = [setting.get(name) for setting in campaign.settings]
     if all(isinstance(value, bool) for value in values):
         return np.array(values)
@@ -181,7 +187,7 @@ def _write_as_text(value: object) -> str:
 
 
 def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: str) -> None:
-    """Create a coordinate along an axis, of one chunk, and write its values."""
+    """Create a coordinate (labels along an axis) in one chunk of the store, and write its values."""
     fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
     shape = values.shape
     _create_array(group, name, (axis,), shape=shape, chunks=shape, fill=fill, attributes={}, kind=values.dtype)
@@ -225,9 +231,9 @@ def _create_array(
 
 
 def _open_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Return an array of the store that writes a chunk's file even if it has only fill values.
+    """Return an array of the store, which is to write a chunk's file even if it has only fill values.
 
-    The file marks the chunk as done.
+    That the file is there is what marks the chunk as done.
     """
     array = group[name]
     assert isinstance(array, zarr.Array)
@@ -243,7 +249,7 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
 
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
-    """Write the claims of the filters of one setting."""
+    """Write what each filter claims of its covariance ("exact", "upper", ...) in one setting, "" where none is."""
     labels = read_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
     _open_array(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
@@ -297,6 +303,7 @@ def _find_chunk_files(folder: Path, indices: int) -> dict[tuple[int, ...], Path]
 
 def remove_partial_files(path: Path) -> None:
     """Remove the partial files of a process that was killed."""
+    # A whole file of a chunk is "c" and numbers; what has more behind them was not finished.
     for folder in path.iterdir():
         for file in folder.iterdir() if folder.is_dir() else ():
             if file.name.startswith("c.") and not all(map(str.isdigit, file.name.split(".")[1:])):

@@ -52,7 +52,7 @@ def estimates_option() -> Parameter:
 
 
 def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
-    """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` is that one.
+    """Return the folder in which a results folder of this name is made: `--out`, or its parent if `--out` has the name.
 
     Raises:
         ValueError: no `--out`, or a folder that cannot be written.
@@ -67,21 +67,21 @@ def choose_results_folder(command: str, out: Path | None, name: str) -> Path:
 
 
 def _convert_to_int(_: type, tokens: Sequence[Token]) -> int:
-    """Convert digits to an integer; fractions are refused."""
+    """Return the integer that an option's digits say; fractions, and underscores between digits, are refused."""
     if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
         raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
     return int(tokens[0].value)
 
 
 def _convert_to_path(_: type, tokens: Sequence[Token]) -> Path:
-    """Convert a text to a path; an empty one is refused."""
+    """Return the path that an option's text is; an empty one, or one with a NUL, is refused."""
     if not tokens[0].value or "\0" in tokens[0].value:
         raise ValueError(f"expected a path, got {tokens[0].value!r}")
     return Path(tokens[0].value)
 
 
 def _convert_to_path_or_store(kind: type, tokens: Sequence[Token]) -> "Path | StoreAddress":
-    """Convert the URL of a store to its address, any other text to a path."""
+    """Return the address of a store of which an option's text is the URL, of any other text the path."""
     from heliograph.files.stores.store_address import is_store, parse_store
 
     return parse_store(tokens[0].value) if is_store(tokens[0].value) else _convert_to_path(kind, tokens)

@@ -80,7 +80,7 @@ def backtest(
         )
 
     def make_results(found: "heliograph.forecasting.Backtest") -> "ResultsContent":
-        """Return the content of the results folder."""
+        """Return the content of the results folder; `refit`: rows between fits of the network's numbers, 0 for none."""
         from heliograph.report.pages.backtest import make_backtest_results
 
         return make_backtest_results(found, network, refit)
@@ -116,9 +116,10 @@ def _describe_coverage(score: "heliograph.forecasting.Score") -> str:
 
 
 def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":
-    """Return a function from a number of rows to the network, its free numbers fitted to the first rows so many."""
+    """Return a function from a number of rows to the network whose free numbers are fitted to so many first rows."""
     from heliograph.files.fitted import NetworkAgain
 
+    # Measurements by node, inputs; NetworkAgain builds the network anew, so that its free numbers can be replaced.
     build, (z, u, _, _) = NetworkAgain(reference), recording
 
     def fit_to_first(rows: int) -> "Network":

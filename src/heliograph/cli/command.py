@@ -53,7 +53,10 @@ for single, arguments in COMMANDS.items():
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
+
+    `stopped`: signals that came; what a signal ended has the code SIGNALLED, 128, plus its number.
+    """
     stopped: list[int] = []
     try:
         with unwind_on_signals(stopped):
@@ -110,7 +113,7 @@ def _print_plain_warnings() -> Iterator[None]:
             message: Warning | str, category: type[Warning], filename: str, lineno: int,
             file: TextIO | None = None, line: str | None = None,
         ) -> None:  # fmt: skip
-            """Print a warning to users as a line; leave others to Python."""
+            """Print a warning to users as a line; leave others to `of_python`, Python's own way to show them."""
             if issubclass(category, UserWarning):
                 from heliograph.disk.quoted_text import visible
 
@@ -123,7 +126,7 @@ def _print_plain_warnings() -> Iterator[None]:
 
 
 def _output_is_lost() -> bool:
-    """Return whether standard output cannot be written: an OSError does not say where it arose."""
+    """Return whether standard output cannot be written, as after `| head`: an OSError does not say where it arose."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -36,7 +36,7 @@ def design(
     file = read_design(task)
 
     def results_of(designed: "DesignResults") -> "ResultsContent":
-        """Return the content of the results folder."""
+        """Return the content of the results folder of a design: figures, page, summary and networks."""
         from heliograph.report.pages.design import make_design_results
 
         return make_design_results(designed)
@@ -49,6 +49,7 @@ def design(
 
 def count_stages(file: "DesignFile") -> int:
     """Return the approximate number of steps for the progress bar."""
+    # The design, rows of the map, budgets of the front, and some three changes to try for each node.
     from heliograph.planning.design_comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)

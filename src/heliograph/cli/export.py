@@ -65,7 +65,10 @@ KINDS = {
 
 
 def describe_costs(written: "Exported", measured: "StepCost") -> list[str]:
-    """Return two lines on the cost of a step: its operations by kind; bytes of state and code, and its time."""
+    """Return two lines on the cost of a step: its operations by kind; bytes of state and code, and its time.
+
+    KINDS: the operations of each kind that is named; what could not be measured is None.
+    """
     from heliograph.export.c_files import COMPILER
 
     counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}

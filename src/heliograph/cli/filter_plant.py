@@ -89,7 +89,10 @@ def write_plant_estimates(
     lag: float | None,
     options: ReadingOptions,
 ) -> list[str]:
-    """Write a plant's estimates, and beside them those of a lag later where there is one; return lines on these."""
+    """Write a plant's estimates, and beside them those given all that came up to `lag` later; return lines on these.
+
+    `lag`: in the unit of time, None for none.
+    """
     write = _make_estimates_writer(plant.data, module)
     predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
     _write_estimates(write, plant.written, plant.forecasts, predicted, place, plant.data)
@@ -97,7 +100,7 @@ def write_plant_estimates(
 
 
 def choose_output_of_plant(out: Path | StoreAddress, plant: str, several: bool) -> Path | StoreAddress:
-    """Return where a plant's estimates go: of several, each has a file of its name."""
+    """Return where a plant's estimates go: of several plants each has a file with its name; a store holds them all."""
     if isinstance(out, StoreAddress):
         return out
     return out.with_name(f"{out.stem}.{quote(plant, safe='')}{out.suffix}") if several else out
@@ -120,7 +123,10 @@ def filter_rows(
 
 
 def _describe_doubted_values(network: "Network", record: "Record") -> list[str]:
-    """Return a line for each output on how many of its values the filters that weigh them doubted, and their bias."""
+    """Return a line for each output on how many of its values filters doubted, and their bias.
+
+    Only filters that weigh values, by how likely they are, doubt any.
+    """
     from heliograph.report.sensor_output_health import summarise_weighed_outputs
 
     return [str(output) for output in summarise_weighed_outputs(network, record)]
@@ -139,7 +145,7 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
         return record
 
     def select(estimate: "Estimate") -> "Estimate":
-        """Return these rows of an estimate."""
+        """Return these `rows`, a mask, of an estimate; of its modes' probabilities too, if it has any."""
         return replace(
             estimate,
             mean=np.asarray(estimate.mean)[rows],
@@ -165,7 +171,7 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
 
 
 def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
-    """Return a forecast of each estimate from the last row."""
+    """Return a forecast of each estimate from the last row, by node and filter; inputs stay as they are there."""
     forecasts = heliograph.forecast(record, ahead, inputs="held")
     assert isinstance(forecasts, dict)  # of a network
     return forecasts
@@ -256,7 +262,10 @@ def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]"
     origin = _find_date_of_time_zero(data)
 
     def write(record: "Record", path: Path | StoreAddress) -> None:
-        """Write the estimates of a record, in the form that the path asks for."""
+        """Write the estimates of a record, in the form that the path asks for: a store, a bag (.mcap) or a table.
+
+        `origin`: date of time 0; `module`: names in the network's file, of which `pose` says what a bag's poses are.
+        """
         if isinstance(path, StoreAddress):
             write_columns_to_store(path, estimate_columns(record), data.plant, origin)
         elif path.suffix.lower() == ".mcap":

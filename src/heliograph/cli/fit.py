@@ -65,7 +65,7 @@ def fit(
     with GentleStop() as stop:
 
         def work(advance: "Advance") -> "FitResults":
-            """Learn with the options of the command."""
+            """Return what is learned with the command's options; `advance` shows progress, `stop` has signals."""
             return fit_and_judge(
                 network, measurements, starts, seed, share, advance, truth, reading or ReadingOptions(), stop
             )
@@ -144,7 +144,10 @@ def fit_and_judge(
 
 
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
-    """Return the statistics of losses of the nodes of which some messages arrived and some did not."""
+    """Return the statistics of losses of the nodes of which some messages arrived and some did not.
+
+    `fates`: by node, sequences of whether each message arrived.
+    """
     from heliograph.learning.packet_losses.learn_losses import learn_losses
 
     fates = _find_message_fates(network, recording)
@@ -222,7 +225,10 @@ def _fit_with_progress(
     )
 
     def show_progress(line: str) -> None:
-        """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal."""
+        """Show a line of the search, such as "linear: step 3", on the bar; end the search after a signal.
+
+        STEPS: at most so many; `stop` has the signals that came.
+        """
         stop.raise_if_requested()
         stop.note_next_signal_only()  # from here on there is a best so far, which the next signal keeps
         form, _, rest = line.partition(":")
@@ -243,7 +249,7 @@ def collect_results_files(learned: "FitResults", out: Path, network: str) -> "Re
     content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
     def write(folder: Path) -> None:
-        """Write the learned numbers and the network with them."""
+        """Write the learned numbers (`content`) and the network with them into a folder, later renamed to `out`."""
         write_fitted(content, network, learned.measurements, folder, out)
 
     summary = {**content, "held_out_rows": learned.held_out, **_convert_comparison_to_json(learned)}

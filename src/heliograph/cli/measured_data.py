@@ -46,7 +46,10 @@ class ReadingOptions:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Return the window, and how much later than its arrival a time may be."""
+        """Return the window, how late an event may come, and how far its time may be past its arrival, in time's unit.
+
+        WINDOW and AHEAD stand for options that are not given.
+        """
         from heliograph.live.event import AHEAD
         from heliograph.numerics.check import scalar
 
@@ -169,7 +172,10 @@ def read_events(
 
 
 def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> MeasuredPlant:
-    """Return the rows of time of a table, with warnings on those that could not be read."""
+    """Return the rows of time of a table as data of a plant without a name, with warnings on rows that were refused.
+
+    REASONS: how many reasons a warning names.
+    """
     from heliograph.files.recording import read_recording_rows
 
     with warnings.catch_warnings(record=True) as doubts:

@@ -111,7 +111,7 @@ def _load_network(reference: str) -> "tuple[Network, Mapping[str, object]]":
 
 
 def _parse_smoothing(word: str) -> "FixedInterval | FixedLag | None":
-    """Read the option: "all" for the fixed interval, a number for a lag, nothing for none."""
+    """Return how to smooth by the option: "all" uses all rows, a number so many later ones; None for no word."""
     from heliograph.numerics.check import fail
     from heliograph.smoothing import FixedInterval, FixedLag
 
@@ -243,7 +243,10 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
-        """Return the diagnosis of a plant, with its forecasts and residuals."""
+        """Return the diagnosis of a plant with its forecasts, predictions, their residuals, and refusals by node.
+
+        Residuals, what was not predicted, are there only where predictions were asked for.
+        """
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}
         health = examine(network, record, inputs, advance)

@@ -79,7 +79,7 @@ def run_in_blocks(
 
 
 def is_long(path: Path, limit: BlockSize = LONG) -> bool:
-    """Return whether a table is beyond a limit: of bytes of CSV, of rows of Parquet."""
+    """Return whether a table is too long to be read at once: beyond a limit of bytes of CSV, or of rows of Parquet."""
     from heliograph.files.text.text_file import find_extension
 
     if not path.is_file():
@@ -98,7 +98,7 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
 def _check_blocks_suffice(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
     """Raise AllRowsNeededError where options, the output or the network need all rows at once.
 
-    `others`: the options that are given and need them.
+    `others`: the options that are given and need all rows. Blocks are written as tables of FORMATS alone.
     """
     from heliograph.disk.atomic_files import FORMATS
     from heliograph.fusion.network_fusion import Fusion
@@ -184,12 +184,13 @@ class WrittenRowCounts:
     """
 
     def __init__(self) -> None:
+        """Begin with no row written."""
         self.rows = 0
         # By NODE/FILTER: what its estimates claim, and in how many rows they claim nothing.
         self._claims, self._rows_without = dict[str, str](), Counter[str]()
 
     def add(self, record: "Record") -> None:
-        """Count the rows of a record."""
+        """Count the rows of a record, and by "node/filter" those in which a filter that has a claim claims none."""
         self.rows += len(record.time)
         for node, filters in record.estimates.items():
             for name, estimate in filters.items():
@@ -213,12 +214,16 @@ class MergedBlockWarnings:
     """Lines on blocks of rows: those that differ in their numbers alone are one, of the first block that has it."""
 
     def __init__(self) -> None:
+        """Begin with no block and no line; `_more`: in how many later blocks a line came again."""
         self._blocks = 0
         self._first = dict[str, tuple[str, str]]()  # by the line without its numbers: rows, line
         self._more = Counter[str]()
 
     def add(self, lines: Iterable[str], first: int, last: int) -> None:
-        """Add the lines on a block, in which rows count from 1; `first` and `last` are the numbers of its rows."""
+        """Add the lines on a block, in which rows count from 1; `first` and `last` are the numbers of its rows.
+
+        Lines that differ in numbers alone (NUMBER) are kept once; `self._more` counts the later blocks that have one.
+        """
         self._blocks += 1
         here = set[str]()
         for line in lines:
@@ -230,7 +235,10 @@ class MergedBlockWarnings:
             here.add(kind)
 
     def list_lines(self) -> list[str]:
-        """Return the lines, which name the rows of their block if there are several."""
+        """Return the lines, which name the rows of their block if there are several blocks.
+
+        `self._first`: by the line without its numbers the first one, with the rows of its block.
+        """
         if self._blocks == 1:
             return [line for _, line in self._first.values()]
         return [

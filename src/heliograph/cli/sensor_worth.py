@@ -81,7 +81,7 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 
 def _check_figure_writable(figure: Path) -> None:
-    """Raise the error that writing the figure would raise."""
+    """Raise the error that writing the figure would raise, before the work: no matplotlib, another format or folder."""
     from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.optional_packages import check_installed
 

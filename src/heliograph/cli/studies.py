@@ -127,7 +127,10 @@ def run_studies(
 
 
 def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: str) -> None:
-    """Raise ValueError for the first name that is no study of this kind; it may be a page of the documentation now."""
+    """Raise ValueError for the first name that is no study of this kind, "example" or "publication".
+
+    PAGES: the pages of the documentation that earlier examples are now.
+    """
     from heliograph.numerics.check import fail
 
     for name in names:
@@ -139,6 +142,8 @@ def _check_names(names: Sequence[str], known: Mapping[str, EntryPoint], kind: st
 
 def change_settings(name: str, study: Study, values: Mapping[str, str], kind: str) -> Any:
     """Return a study's settings with other values; an error names the option by which a wrong value was given.
+
+    A value that is an `OptionValue` came by an option of its own, others by a general one.
 
     Raises:
         ValueError: no such setting, or a value that is none.
@@ -187,7 +192,10 @@ def collect_changes(changes: Sequence[str] | None, **options: object) -> dict[st
 
 
 def list_studies(kind: str) -> dict[str, EntryPoint]:
-    """Return the studies of a kind, "publication" or "example", of installed packages, without importing any."""
+    """Return the studies of a kind, "publication" or "example", of installed packages, without importing any.
+
+    Packages offer them as entry points of GROUP; the function's name (`attr`) says of which kind one is.
+    """
     offered: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         other = offered.setdefault(entry.name, entry).value

@@ -74,7 +74,7 @@ def _open_locked(path: Path) -> int | None:
 
 
 def _is_path_of_handle(path: Path, handle: int) -> bool:
-    """Return whether a path is that of an open file."""
+    """Return whether a path is that of the open file `handle`; False if nothing is there any more."""
     with suppress(FileNotFoundError):
         other = os.open(path, os.O_RDONLY)
         same = os.path.sameopenfile(handle, other)
@@ -166,7 +166,7 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _remove_leftover_files(path: Path) -> None:
-    """Remove the temporary files next to `path` of processes that no longer run."""
+    """Remove the temporary files next to `path`, named .NAME.PROCESS.*.partial, of processes that no longer run."""
     for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
         if not _is_running(left.name.split(".")[-2]):
             left.unlink(missing_ok=True)
@@ -174,6 +174,7 @@ def _remove_leftover_files(path: Path) -> None:
 
 def _is_running(process: str) -> bool:
     """Return whether a process of this number runs; True where that is unknown."""
+    # Signal 0 is sent to nobody: it only fails where there is no such process.
     try:
         os.kill(int(process), 0)
     except ProcessLookupError:
@@ -217,7 +218,7 @@ def check_folder_writable(folder: str | Path) -> None:
 
 
 def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    """Return the extension of a file name in lower case, which determines the format."""
+    """Return the extension of a file name in lower case, which determines the format; ValueError at an unknown one."""
     kind = path.suffix.lower()
     if kind not in formats:
         raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
@@ -225,7 +226,10 @@ def format_of(path: Path, formats: Sequence[str] = FORMATS) -> str:
 
 
 def check_replaceable(target: Path, mark: str) -> None:
-    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results."""
+    """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results.
+
+    A lock file, LOCK, counts as nothing. Folders that killed processes left beside it are removed first.
+    """
     check_folder_writable(target)
     remove_leftover_folders(target)
     if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():
@@ -267,7 +271,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
 
 
 def _restore_old_folder(temporary: Path, target: Path) -> None:
-    """Put earlier results that were moved aside back in place of `target`, and remove the temporary folder."""
+    """Put earlier results, moved aside into `temporary`/old, back in place of `target`; remove the temporary folder."""
     if (temporary / "old").exists() and not target.exists():
         (temporary / "old").rename(target)
     shutil.rmtree(temporary, ignore_errors=True)

@@ -217,7 +217,7 @@ def _measure_code_size(folder: Path) -> int | None:
     """Return the bytes of text and constants of the object file, without debugging data."""
     if shutil.which("size") is None:
         return None
-    # Lines of name, size and address.
+    # Lines of name, size and address; sections named with two underscores are those of macOS.
     listed = _run_command("size", "-A", "step.o", folder=folder)
     sections = re.findall(r"^(\S+)\s+(\d+)\s+\d+$", listed, re.MULTILINE)
     return sum(int(size) for name, size in sections if name.startswith((".text", ".rodata", "__text", "__const")))

@@ -5,7 +5,10 @@ from heliograph.export.step_program import Real, StepProgram
 
 
 def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the functions that move the state: of the step, or also of its parts, the step last."""
+    """Return the heads of the functions in C that move the state: of the step, or also of its parts, the step last.
+
+    The parts are prediction and correction; `start_at` makes the state of a given mean and covariance, where one can.
+    """
     state = f"{prefix}_state *state"
     step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
     if len(program.parts) == 1:
@@ -17,7 +20,10 @@ def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
 
 
 def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
-    """Return the declaration of what a correction tells beside the estimate; "" of a whole step."""
+    """Return the declaration in C of what a correction tells beside the estimate; "" of a program of whole steps alone.
+
+    Value and weights of the innovation, nis (its square over its covariance) and how many components arrived.
+    """
     if len(program.parts) == 1:
         return ""
     count = max(program.filter.received, 1)
@@ -91,7 +97,7 @@ def _generate_measurement_check(program: StepProgram) -> list[str]:
 
 
 def _generate_inputs_check(program: StepProgram) -> list[str]:
-    """Return the statements that refuse inputs that are not finite, and a step past the end."""
+    """Return the statements of C that refuse inputs that are not finite (return 2), and a step past the end (3)."""
     lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
     if program.filter.horizon is not None:
         lines.append(f"    if (state->step >= {program.filter.horizon}) {{ return 3; }}")
@@ -138,9 +144,10 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
 
 
 def _name_place_of_result(name: str) -> str:
-    """Return the C expression for where a result beside the state is written: flags are local, others in `news`.
+    """Return the C expression for where a result beside the state is written.
 
-    That is the innovation that the function tells; of it single numbers are passed by their address.
+    Flags are local variables; all others are members of `news`, the innovation that the function tells. Its single
+    numbers are passed by their address, its arrays as they are.
     """
     if name in ("implausible", "spoilt"):
         return name
@@ -150,7 +157,8 @@ def _name_place_of_result(name: str) -> str:
 def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> str:
     """Return the C expression for the number of the step that a part belongs to.
 
-    A prediction counts the step: a correction's is one less than the state's count.
+    A prediction raises the state's count, so that the correction after it belongs to one less. Without a count, of a
+    filter for which all steps are alike, it is 0.
     """
     if not program.counts:
         return "0"
@@ -158,7 +166,10 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
 
 
 def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
-    """Return the statements of a start from a given mean and covariance."""
+    """Return the statements of C of a start from a given mean and covariance; they return 7 where these are invalid.
+
+    The state `after` is written to the caller's only where it is valid; the flag `none` is 1 where there is none.
+    """
     members = ", ".join(f"after.{m.name}" for m in program.members)
     return [
         f"    {prefix}_state after;",

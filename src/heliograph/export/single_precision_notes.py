@@ -16,7 +16,10 @@ HALF_UNIT = 2.0**-24  # by which single precision rounds, of the number
 
 
 def explain_ranges(filter: AbstractFilter) -> list[str]:
-    """Return a note for each component of z, up to which size its rounding is small beside its noise; "" if unknown."""
+    """Return a note for each component of z, up to which size its rounding is small beside its noise; "" if unknown.
+
+    HALF_UNIT is the largest relative error of rounding to single precision, SHARE the part of the noise it may be.
+    """
     deviations = _find_noise_deviations(filter)
     if deviations is None:
         return [""] * filter.received
@@ -24,7 +27,10 @@ def explain_ranges(filter: AbstractFilter) -> list[str]:
 
 
 def explain_rounding(filter: AbstractFilter, ranged: bool) -> list[str]:
-    """Return lines for the header: on the ranges of z, if some have one, and on the part of the mean that is apart."""
+    """Return lines for the C header: on the ranges of z, if it has notes on them, and on the mean's low digits.
+
+    A state in single precision may keep the digits of the mean that a float leaves out in a second array, `low`.
+    """
     lines = [
         "Up to the size that is noted, single precision rounds a component of z by a hundredth of its noise at most;",
         "beyond it take an origin off before it becomes a float, and off plant and sensor.",

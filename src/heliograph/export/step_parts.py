@@ -67,11 +67,15 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
 
 
 def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
-    """Return the function of a whole step; `tree` is the structure of a state, of which C has the arrays."""
+    """Return the function of a whole step; `tree`: structure of a state, of which C has the arrays of type `real`."""
 
     @jax.jit
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        """Return state, estimate and two flags after a step."""
+        """Return the arrays of the state, the estimate and two flags after step k, with measurement z and input u.
+
+        The flags: z or u is implausible (see `is_implausible`); u spoils the digits of numbers of type `real`, of which
+        ROUNDING is the relative error after many steps, PRECISION NumPy's type. `tree`: structure of the state.
+        """
         after, estimate, judgement, innovation = filter.judge_step(jax.tree.unflatten(tree, arrays), z, u, k)
         implausible = is_implausible(innovation, z, ROUNDING[real]) | (judgement.input > 0)
         spoilt = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
@@ -85,7 +89,10 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
     @jax.jit
     def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:
-        """Return state, estimate and two flags after a prediction."""
+        """Return the arrays of the state, the estimate and two flags after the prediction of step k with input u.
+
+        The flags: u is implausible; u spoils the digits of numbers of type `real`. `tree`: structure of the state.
+        """
         before = jax.tree.unflatten(tree, arrays)
         prior = filter.predict(before, u, k)
         estimates = filter.estimate(before), filter.estimate(prior)
@@ -101,7 +108,10 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
     @jax.jit
     def correct(arrays: list[jax.Array], z: jax.Array, k: jax.Array) -> list[jax.Array]:
-        """Return state, estimate, a flag, and what a correction tells."""
+        """Return the arrays of the state, the estimate, a flag, and what the correction with z in step k tells.
+
+        The flag: z is implausible. Told are innovation, its squared distance, how much arrived, and any weights.
+        """
         prior = jax.tree.unflatten(tree, arrays)
         after, innovation = filter.correct(prior, z, k)
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)
@@ -117,10 +127,11 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
 
 
 def is_implausible(innovation: Innovation, z: jax.Array, rounding: float) -> jax.Array:
-    """Return whether some component is larger than expected, and too many of its own deviations away from that.
+    """Return whether some component of z is larger than expected, and too many of its own deviations away from that.
 
     The deviation of one component is cheap, where those of all together are not. Where the innovation is of a part of
-    z, such as a neighbour's measurement, every component that is so far away counts.
+    z, such as a neighbour's measurement, every component that is so far away counts. A difference within `rounding`,
+    relative to z, counts nothing.
     """
     far, differs = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if differs.shape == z.shape:

@@ -122,7 +122,10 @@ def lower_step_to_c_functions(
 
 
 def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMember], list[StateMember]]:
-    """Return members of the state in C: the arrays of the filter's state, and the estimate's mean and covariance."""
+    """Return members of the state in C: the arrays of the filter's state, and the estimate's mean and covariance.
+
+    Each is a name and its numbers before the first step.
+    """
     named_arrays = zip(name_state_arrays(state), jax.tree.leaves(state), strict=True)
     of_state = [StateMember(name, np.asarray(array)) for name, array in named_arrays]
     of_estimate = [
@@ -133,7 +136,10 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
 
 
 def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
-    """Return the first result that is equal to this one after every part and before the first; itself where none is."""
+    """Return the first result that is equal to result `number` after every part and at the start; else `number` itself.
+
+    `same`: number of the first result of a part that always equals this one; `named`: numbers at the start.
+    """
     same = [n for n in range(number) if all(code.results[n].same == code.results[number].same for code in parts)]
     start = named[number].start
     return next((n for n in same if np.array_equal(named[n].start, start, equal_nan=True)), number)
@@ -207,7 +213,11 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
 
     @jax.jit
     def start_from_moments(mean: jax.Array, covariance: jax.Array) -> list[jax.Array]:
-        """Return the members of the state of a mean and covariance, and whether these are invalid."""
+        """Return the members of the state of a mean and covariance, and whether these are invalid.
+
+        `make_state`: from moments; `kept`: which arrays of state and estimate are members; SAME: 1e-6 deviations, by
+        which a covariance's factors may miss it. What is no covariance has no factors that give it back.
+        """
         state = make_state(mean, covariance)
         estimate = filter.estimate(state)
         results = [*jax.tree.leaves(state), estimate.mean, estimate.covariance]
@@ -229,9 +239,10 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
 
 
 def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
-    """Return which arrays of the state are always symmetric, of which one triangle is read.
+    """Return which arrays of the state, by number, are always symmetric, so that one triangle of each is enough.
 
-    By induction: symmetric at the start, and after each part from symmetric ones. Assume all, drop those that are not.
+    By induction: symmetric at the start, and after each part (prediction, correction) from symmetric ones. All that are
+    at the start are assumed so, and those that a part then makes otherwise are dropped, until none is.
     """
     leaves = parts[0].examples[0]
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
@@ -258,7 +269,7 @@ def name_state_arrays(state: PyTree) -> list[str]:
         joined = "_".join(part for part in parts if part != "gaussian")
         text = "".join(c if c.isalnum() and c.isascii() else "_" for c in joined)
         text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
-        while text in RESERVED | ADDED or text in names:
+        while text in RESERVED | ADDED or text in names:  # words of C, members beside these, names given before
             text += "_"
         names.append(text)
     return names

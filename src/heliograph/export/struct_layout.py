@@ -19,7 +19,10 @@ def lay_out_array(type: str, count: int) -> StructLayout:
 
 
 def lay_out_struct(parts: Sequence[StructLayout]) -> StructLayout:
-    """Return the layout of a struct of these parts, each aligned, and filled up to a multiple of its largest number."""
+    """Return size and alignment, in bytes, of a struct of C with these parts.
+
+    Each part begins at a multiple of its alignment; the whole is filled up to a multiple of the largest of them.
+    """
 
     def round_up(total: int, alignment: int) -> int:
         """Return the next multiple of `alignment`."""

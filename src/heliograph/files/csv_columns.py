@@ -42,7 +42,10 @@ def read_csv_blocks(
 
 
 def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:
-    """Return the rows of some lines: all at once where they are plain, else by their cells, which say what is wrong."""
+    """Return the rows of some lines: all at once where they are plain numbers, else cell by cell, with what fails.
+
+    `text` splits lines into cells and knows the header; it is open where a quoted cell goes on in the next line.
+    """
     # Line by line until the header, with the names of the columns, has come.
     rows, begin = list[CsvRow | InputError](), 0
     while begin < len(lines) and not text.header:
@@ -69,10 +72,11 @@ class CsvColumnReader:
     """
 
     def __init__(self, source: str, path: Path | None, only: Container[str] | None, strict: bool):
+        """Begin without a header; `only`: columns to read, None for all; `strict`: a row that fails is an error."""
         self.source, self.path, self._only, self._strict = source, path, only, strict
         self.header: list[str] = []
         self._dated = dict[str, bool]()  # by column whether it is of dates, once a cell has said so
-        self._zoned = dict[str, bool]()  # whether these have a zone
+        self._zoned = dict[str, bool]()  # by column of dates whether these have a zone
 
     def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
         """Return the rows that can be read, as columns; why the others cannot.
@@ -103,7 +107,10 @@ class CsvColumnReader:
         return TableRows(columns, np.array(numbers, dtype=np.int64), refused)
 
     def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
-        """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles."""
+        """Return whether these numbers are what cells say: none in a column of dates, or too large for doubles.
+
+        From EXACT, 2^53, doubles no longer hold every whole number.
+        """
         if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
             return False
         dated = [i for i, name in enumerate(header) if self._dated.get(name)]
@@ -112,7 +119,10 @@ class CsvColumnReader:
     def make_rows_of_numbers(
         self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int
     ) -> TableRows:
-        """Return numbers under this header as rows, the number of whose first one is `first`."""
+        """Return numbers under this header as rows, numbered from `first`.
+
+        `self._dated` says by column whether it is of dates, once a cell has said it; an all-empty column says nothing.
+        """
         self.header, columns = header, dict[str, np.ndarray]()
         for name, values in zip(header, numbers.T, strict=True):
             if self._only is not None and name not in self._only:
@@ -163,7 +173,10 @@ class CsvColumnReader:
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
     def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
-        """Return a date as nanoseconds; raise where dates of one column differ in having a zone."""
+        """Return a date as nanoseconds since 1970; raise where dates of one column differ in having a zone.
+
+        `self._zoned`: by column whether its first date has one.
+        """
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)
         if self._zoned.setdefault(name, zoned) != zoned:
@@ -171,7 +184,10 @@ class CsvColumnReader:
         return moment
 
     def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
-        """Return a column as dates, or as int64 if its cells are whole numbers that doubles cannot tell apart."""
+        """Return a column as dates, as int64 if its cells are whole numbers that doubles cannot tell apart, or floats.
+
+        `values` of dates are nanoseconds since 1970, NAT for an empty cell; EXACT: 2^53, up to which doubles are exact.
+        """
         if self._dated.get(name):
             whole = [NAT if value != value else int(value) for value in values]  # before the first date all are empty
             return np.array(whole, dtype=np.int64).view("datetime64[ns]")

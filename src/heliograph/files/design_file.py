@@ -71,7 +71,10 @@ def read_design(path: Path) -> DesignFile:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a design file, of which only keys are checked: those at the top and in its tables."""
+    """Return the content of a design file, of which only keys are checked: those at the top and in its tables.
+
+    KEYS: the keys that are known at the top; TABLES: of each table those that are known in it.
+    """
     if not path.is_file():
         raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
     try:
@@ -116,7 +119,7 @@ def _read_number(path: Path, table: Mapping[str, Any], key: str) -> float | None
 
 
 def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
-    """Return the budget: a table of limits, a number for the total, or None."""
+    """Return the budget of powers: a table of limits, a number that limits their total, or None where there is none."""
     value = table.get("budget")
     if value is None:
         return None
@@ -140,6 +143,7 @@ def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
     """Return the Python file beside the design file that a value names, as FILE or FILE:NAME, and NAME or ""."""
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
+    # What follows the last colon is a name only if it can be one: paths, as "C:/net.py", have colons too.
     file_name, colon, name = value.rpartition(":")
     file_name, name = (file_name, name) if colon and name.isidentifier() else (value, "")
     file = path.parent / file_name
@@ -149,7 +153,7 @@ def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
 
 
 def _read_table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
-    """Return the table under a key; raise if something else stands there."""
+    """Return the table under a key, one of TABLES (its known keys by name); raise if something else stands there."""
     value = table[key]
     if not isinstance(value, dict):
         raise fail(f"{path.name}, {key}", f"a table of {', '.join(TABLES[key])}", repr(value))

@@ -56,14 +56,17 @@ class Available:
             raise fail("Available, offline", "other words than online", both[0])
 
     def of(self, topic: str) -> str:
-        """Return the topic on which the device of a topic of values says its word."""
+        """Return the topic on which the device that sends values on `topic` says whether it is online.
+
+        It is `self.topic`, where + stands for the level of `topic` at the same place.
+        """
         levels, values = self.topic.split("/"), topic.split("/")
         if "+" in levels[len(values) :]:
             raise fail(f"Available, topic {self.topic!r}", f"+ at levels that {topic!r} has", "more levels")
         return "/".join(values[i] if level == "+" else level for i, level in enumerate(levels))
 
     def says_offline(self, payload: object, where: str) -> bool:
-        """Return whether a payload says offline.
+        """Return whether a payload, a word or an object with one at `self.path`, says offline rather than online.
 
         Raises:
             ValueError: a word that is neither; one line.
@@ -82,7 +85,11 @@ class DeviceStatuses:
     """
 
     def __init__(self, conditions: Iterable[Available]):
-        """Begin with no word of any device; `conditions`: of sources, on the topics where devices say them."""
+        """Begin with no word, online or offline, of any device; `conditions`: topics and words by which they say it.
+
+        `_offline`: conditions, with the topic, of which the last word was offline; `_heard`: those that had any word;
+        `_changed`: topics with a new word.
+        """
         self._by_pattern: dict[str, list[Available]] = {}
         for condition in dict.fromkeys(conditions):
             self._by_pattern.setdefault(condition.topic, []).append(condition)
@@ -105,7 +112,9 @@ class DeviceStatuses:
         return [condition for several in matching for condition in several]
 
     def take_status_message(self, topic: str, payload: object, where: str) -> bool:
-        """Note the last word of a device if a message is one; return whether it is.
+        """Note the last word of a device, online or offline, if a message is one; return whether it is.
+
+        An empty message, which deletes a stored word, counts as online.
 
         Args:
             topic: the topic of the message.
@@ -118,6 +127,7 @@ class DeviceStatuses:
         conditions = self.find_conditions(topic)
         if not conditions:
             return False
+        # The words of a topic are a bit for each condition, as they are stored when they have changed.
         said, before = _decode_payload(payload, where), self._encode_words_as_bits(topic)
         for condition in conditions:
             self._note_word(condition, topic, offline=said != "" and condition.says_offline(said, where))
@@ -131,13 +141,13 @@ class DeviceStatuses:
         return {topic: self._encode_words_as_bits(topic) for topic in changed}
 
     def restore(self, words: Mapping[str, int]) -> None:
-        """Take last words that were kept: of each topic its words as a number, as `pop_changed_words` gives them."""
+        """Take last words that were kept: of each topic a number whose bit i is 1 if condition i of it says offline."""
         for topic, bits in words.items():
             for i, condition in enumerate(self.find_conditions(topic)):
                 self._note_word(condition, topic, offline=bool((bits >> i) & 1))
 
     def _note_word(self, condition: Available, topic: str, offline: bool) -> None:
-        """Note the word of a topic for a condition."""
+        """Note the word of a topic for a condition: heard, and offline or not (devices count as online until then)."""
         self._heard.add(condition)
         if offline:
             self._offline.add((condition, topic))
@@ -155,7 +165,10 @@ class DeviceStatuses:
 
 
 def _decode_payload(payload: object, where: str) -> object:
-    """Return what a payload says: JSON, or the text itself."""
+    """Return what a payload says: what JSON in it encodes, or the text itself where it is none.
+
+    What is neither bytes nor text was decoded already.
+    """
     if isinstance(payload, bytes):
         payload = payload.decode(errors="replace")
     if not isinstance(payload, str):

@@ -72,7 +72,7 @@ class NodeEvents:
         return np.array(self.values).reshape(len(self.time), self.size)
 
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
-        """Note a message that could not be read: its reason, and its count at its time or arrival, else the newest."""
+        """Note an unread message: why, and its count at its time, else its arrival, else the newest event's time."""
         if isinstance(unread.error, RefusedError):
             self.refused[unread.error.reason] += 1
         reading = unread.counted
@@ -85,9 +85,9 @@ class NodeEvents:
             self.period = reading.period
 
     def count_lost(self) -> int | None:
-        """Return how many messages are missing by the node's count, in the order of its times; None without a count.
+        """Return how many messages are missing by the node's count, in order of its times; None without a count (-1).
 
-        A message that came and could not be read, or whose stamp was not set, is none that was lost.
+        Those that came and are no events, unread or without a stamp, are in `self.unread`: they were not lost.
         """
         time, _, sequence = self.arrays()
         if not len(time) or sequence.min() < 0:
@@ -101,7 +101,7 @@ class NodeEvents:
     ) -> None:
         """Write how many messages were lost before each event into the last column of the node's `table`.
 
-        The running counts say it, of the events in `rows`, in order of time, whose messages do not have the number.
+        Only where a message does not say it (NaN), by the running `counts` of the events, in order of time, in `rows`.
         """
         gaps = np.diff(counts, prepend=counts[:1]) - 1.0
         gaps[gaps < 0] = np.nan  # the first, and after a restart
@@ -175,7 +175,7 @@ class NodeEvents:
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
         """Note events with unset stamps as messages that came and are no events: moments near them, and counts.
 
-        Without arrivals each came when the last set one before it did, or else the first set one.
+        Without arrivals each came at the time of the last event before it with a set stamp, or else of the first such.
         """
         time, moments, sequence = self.arrays()
         if not are_arrivals_known:
@@ -278,7 +278,7 @@ def _judge_repeated_events(
 def count_verdicts(
     node: Int[np.ndarray, " events"], verdicts: Int[np.ndarray, " events"]
 ) -> dict[int, dict[Verdict, int]]:
-    """Return {number of a node: {verdict: how many of its events have it}}; both arrays have one for each event."""
+    """Return {number of a node: {verdict: how many of its events have it}}; `verdicts`: of each event by its index."""
     return {
         int(n): {verdict: int(np.sum(verdicts[node == n] == i)) for i, verdict in enumerate(VERDICTS)}
         for n in np.unique(node)
@@ -289,7 +289,7 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
     """Return how many counts are missing between a node's messages, in the order of their times.
 
     After `period` messages the count begins at 0 again (0: it does not). A smaller count is a node that was restarted,
-    unless it follows after at most `GAP` messages.
+    unless, counted around, at most GAP (2^14) messages lie between.
     """
     if not len(time):
         return 0
@@ -301,7 +301,7 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
 
 
 def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return for each row how many equal ones come before it; rows are entries of the columns at one index."""
+    """Return for each row how many equal ones, of the same rank, come before it; row i has entry i of each column."""
     ranks = _rank_rows(*columns)
     order = np.argsort(ranks, kind="stable")
     first = np.searchsorted(ranks[order], ranks[order])
@@ -311,8 +311,8 @@ def count_equal_rows_before(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
 
 
 def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
-    """Return the dense rank of each row by these columns, the first of which matters most."""
-    order = np.lexsort(columns[::-1])
+    """Return the rank of each row by these columns, the first of which matters most; equal rows have the same rank."""
+    order = np.lexsort(columns[::-1])  # which takes the one that matters most last
     new = np.zeros(len(order), dtype=bool)
     for column in columns:
         new[1:] |= column[order][1:] != column[order][:-1]
@@ -326,7 +326,7 @@ def _find_newest_final_row(
 ) -> Int[np.ndarray, " events"]:
     """Return the rank of the newest row that is final when each event comes, -1 for none.
 
-    An event of time t is final for the events that come after it at more than t + window.
+    `rank`: number of each event's row. An event of time t is final for those that come after it, later than t + window.
     """
     count = len(rank)
     if not np.isfinite(window):
@@ -344,7 +344,7 @@ def node_counts_losses(network: Network, name: str) -> bool:
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
-    return node.trigger.side_information(len(node.outputs)) == 1
+    return node.trigger.side_information(len(node.outputs)) == 1  # how many numbers on losses come with the values
 
 
 def number_rows(time: np.ndarray, steps: bool, joint: bool) -> tuple[Int[np.ndarray, " events"], np.ndarray]:
@@ -390,9 +390,9 @@ def make_inputs_leading_to_rows(
 
     Args:
         held: inputs as they were set up to each row; before the first they are 0.
-        times: of the rows, in units of which so many are one unit of time.
-        unit: how many.
-        place: of the time since the row before, dt, among the inputs.
+        times: times of the rows, in whole parts of the unit of time, such as nanoseconds.
+        unit: how many of these parts are one unit of time.
+        place: index of dt, the time since the row before, among the inputs.
     """
     before = np.vstack([np.zeros((1, held.shape[1])), held[:-1]])
     since = np.diff(times, prepend=times[:1]) / unit

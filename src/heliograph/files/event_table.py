@@ -58,7 +58,7 @@ class EventTable:
     """
 
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
-        """Begin with no event; `step`: seconds of a step, `start`: of step 0; `numbers`: whether times are numbers."""
+        """Begin with no event; `step`: seconds of a step, `start`: moment of step 0; `numbers`: times are no dates."""
         instance("network", network, Network, "a Network")
         self.network, self.steps, self.numbers, self.start = network, TIME_STEP not in network.inputs, numbers, start
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
@@ -76,7 +76,7 @@ class EventTable:
         return list(self._plants)
 
     def of(self, plant: str) -> "EventTable":
-        """Return the events of one plant.
+        """Return the events of one plant, as a table that shares its columns with this one.
 
         Args:
             plant: its name.
@@ -101,7 +101,7 @@ class EventTable:
         return next(iter(self._plants.values()), {}) or self._columns_of_plant("")
 
     def _columns_of_plant(self, plant: str) -> dict[str, NodeEvents]:
-        """Return the columns of a plant by node, and of its inputs; empty ones where it is new."""
+        """Return the columns of a plant by node, and of its inputs without dt; empty ones where it is new."""
         if plant not in self._plants:
             sizes = {INPUTS: len(self.network.inputs) - (not self.steps)}
             sizes |= {name: self.network.nodes[name].received for name in self.network.names}
@@ -111,7 +111,7 @@ class EventTable:
     def add(self, reading: Reading, arrival: float) -> None:
         """Append a reading that arrived at a moment, in nanoseconds since 1970 or in the unit of times.
 
-        Without a time it is of that moment.
+        Without a time it is of that moment. A count of -1 says that it has none.
         """
         columns = self._columns_of_plant(reading.plant)[reading.node]
         time = arrival if reading.time is None else reading.time
@@ -155,7 +155,7 @@ class EventTable:
         return counts
 
     def refuse(self, error: InputError, strict: bool) -> None:
-        """Count a message that cannot be read, with the reason.
+        """Count a message that cannot be read, and keep the reasons of the first three.
 
         Raises:
             ValueError: this error, where reading is strict.
@@ -232,16 +232,16 @@ class EventTable:
         return np.datetime64(self._find_first_moment() if self.dated else 0, "ns")
 
     def sort_events(self) -> Iterator[Event]:
-        """Yield the events in order of arrival, with times in seconds from the origin, in steps, or as they are."""
+        """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
         events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
-        # Exact differences of whole nanoseconds before they are floats.
+        # `place`: index among the node's events. Differences are of whole nanoseconds, exact before they are floats.
         for node, time, arrival, sequence, place in zip(*(column.tolist() for column in events), strict=True):
             values = matrices[node][place]
             yield Event(names[node], sequence, (time - origin) / unit, values, (arrival - origin) / unit)
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
-        """Return by node that has events the seconds from measuring to logging of each, in order of their times."""
+        """Return by node with events how long each took to be logged, in seconds or time's unit, in order of time."""
         results, second = {}, 1 if self.numbers else SECOND
         for name in () if self._times_are_steps else self.network.names:
             time, arrival, _ = self.columns[name].arrays()
@@ -250,7 +250,7 @@ class EventTable:
         return results
 
     def delays(self, step: float | None = None) -> dict[str, Delays]:
-        """Return by node the law of its delays in steps, with intervals; nodes without any are absent.
+        """Return by node the law (probabilities) of its delays in steps, with intervals; nodes without any are absent.
 
         Args:
             step: seconds of a step; that of the table, else the median time between a node's measurements.
@@ -272,7 +272,7 @@ class EventTable:
     def judge(
         self, window: float = np.inf, ahead: float = AHEAD
     ) -> tuple["dict[str, dict[Verdict, int]]", dict[str, int]]:
-        """Count the verdicts of a timeline on the events by node, and the gaps in the nodes' counts.
+        """Count by node what a timeline makes of the events (used, late, ...), and messages missing by running counts.
 
         Args:
             window: how late an event may be, in seconds or steps (default any).
@@ -389,7 +389,7 @@ class EventTable:
         return events._replace(time=time, arrival=arrival)
 
     def _judge_events(self, window: float, ahead: float) -> tuple[EventsByArrival, Int[np.ndarray, " events"]]:
-        """Return the events in order of arrival, and what a timeline with this window would do with each."""
+        """Return the events in order of arrival, and what a timeline with these limits would do with each."""
         events, matrices = self._sort_by_arrival(), self._list_value_matrices()
 
         def values(i: int) -> np.ndarray:

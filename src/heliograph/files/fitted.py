@@ -48,7 +48,10 @@ class NetworkAgain:
 
 
 def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
-    """Return values by name, the table, the sentences and the search, for JSON; NaN becomes null."""
+    """Return a fit for JSON: fitted values by name, their table, sentences on them, how the search went; NaN is null.
+
+    `ends`: the log-likelihood that each of the search's starts came to; `more`: entries to put before these.
+    """
     return {
         **more,
         "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},

@@ -85,7 +85,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
     # Each call may import more modules of the folder, and may fail in the user's code.
     @wraps(function)
     def build(*args: object, **kwargs: object) -> Network:
-        """Return the network that the function returns, checked."""
+        """Return the network that the user's `function`, which stands in the file `path`, returns, checked."""
         with _allow_imports_from(path.parent):
             network = _call_user_code(lambda: function(*args, **kwargs), reference, path)
         if not isinstance(network, Network):
@@ -96,7 +96,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
 
 
 def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
-    """Return the network of a module, by its name or because there is only one."""
+    """Return the network of a module, by its name or because there is only one; `file`: its reference, for errors."""
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
         return _read_named_network(module, name, file, path, networks)
@@ -129,7 +129,7 @@ def _read_named_network(
 
 
 def _find_source_file(module: str) -> Path | None:
-    """Return the file of an importable module, so that errors are reported with their line."""
+    """Return the file of an importable module, so that errors are reported with their line; None if it has no file."""
     spec = find_spec(module)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {module!r}")
@@ -153,7 +153,10 @@ def _run_source(path: Path, source: str | bytes) -> ModuleType:
 
 
 def _call_user_code(call: Callable[[], T], name: str, path: Path | None) -> T:
-    """Call the user's code; an error in it becomes one line with its type, message and line."""
+    """Return what the user's code returns; an error in it becomes one line with its type, message and line.
+
+    `name`: of the network, for errors; `path`: the user's file, None of a module whose file is not known.
+    """
     try:
         return call()
     except (Exception, SystemExit) as error:

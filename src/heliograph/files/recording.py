@@ -115,6 +115,7 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
     columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
     for node, names in list_received_columns(network).items():
         if node in recording.measurements:
+            # Of the names that `read_recording` takes for a component the first is written.
             columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
     if recording.truth is not None:
         columns |= dict(zip(list_truth_columns(network).values(), recording.truth.T, strict=True))
@@ -133,6 +134,7 @@ def _map_headers(network: Network) -> dict[str, str]:
     headers |= {f"truth.{append_unit(name)}": f"truth.{name}" for name in network.states}
     for node, components in received.items():
         headers |= {f"{node}.{append_unit(name)}": f"{node}.{name}" for name in components}
+    # The last of equal headers wins below: a plain name before a header with a unit, and this before one as written.
     as_written = {predict_name_read_back(header): name for header, name in headers.items()}
     without_unit = {name: name for name in (TIME, *headers.values())}
     return as_written | headers | without_unit
@@ -153,8 +155,9 @@ class RowReader:
     """
 
     def __init__(self, network: Network, source: str, strict: bool, ignore_unknown: bool):
+        """Begin with no row; where `strict`, the first that cannot be read is an error, else it is refused alone."""
         self.network, self.source, self._strict = network, source, strict
-        self._headers = _map_headers(network)
+        self._headers = _map_headers(network)  # {header that a column may have: its name}
         self.only: Mapping[str, str] | None = self._headers if ignore_unknown else None
         self.refused = list[InputError]()
         self._behind = 0  # rows that came after later ones
@@ -166,7 +169,7 @@ class RowReader:
 
     @property
     def notes(self) -> list[str]:
-        """Return lines on what was put in order."""
+        """Return a line on how many rows came after later ones and were put in the order of their times, or none."""
         if not self._behind:
             return []
         return [f"{self.source}: rows that came after later ones, used in the order of their times: {self._behind}"]
@@ -189,7 +192,10 @@ class RowReader:
         return self.make_recording(self.put_in_order(cells))
 
     def put_in_order(self, cells: RecordingRows) -> RecordingRows:
-        """Return rows in the order of their times, as far as that can be; where reading is strict, as they are."""
+        """Return rows in the order of their times, as far as that can be; where reading is strict, as they are.
+
+        `self._behind` counts rows that came after later ones, `self.refused` has why rows were left out.
+        """
         if self._strict:
             return cells
         cells, refused, behind = order_rows(cells, self.network, self.source)
@@ -223,7 +229,9 @@ class RowReader:
         return Recording(measurements, u[begin:], time[begin:], truth)
 
     def read_cells(self, rows: TableRows) -> RecordingRows:
-        """Return what stands in the rows that can be read, each by itself.
+        """Return what stands in the rows that can be read, each by itself: time, inputs, measurements, truth.
+
+        `self._headers`: {header that a column may have: its name}; `refusals.good`: rows that were not refused.
 
         Raises:
             ValueError: what `read` refuses, but for times that go backwards.

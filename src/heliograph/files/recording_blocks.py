@@ -49,10 +49,12 @@ class RecordingBlocks:
         block: BlockSize = USUAL_BLOCK,
         progress: Progress | None = None,
     ):
+        """Prepare to read a table in blocks; `strict`: a row that cannot be read is an error, else refused alone."""
         self._path, self._strict, self._block, self._progress = path, strict, block, progress
         self._reader = RowReader(network, str(path), strict, ignore_unknown)
         self._last_number = 0  # of the rows read so far, refused ones included
         self._done, self._total = 0, 0  # how much of the file is read, and of how much, as progress has it
+        # Rows refused, with the first reasons; rows yielded; warnings.
         self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
 
     @property
@@ -66,7 +68,7 @@ class RecordingBlocks:
         return round(self._last_number * self._total / max(self._done, 1))
 
     def __iter__(self) -> Iterator[Recording]:
-        """Yield the blocks.
+        """Yield the recording in blocks of `self._block.rows` rows; ValueError where there is no row that can be read.
 
         Raises:
             RowsNotInBlocksError: only all rows together say in which order they are, or of which kind their times.
@@ -103,7 +105,7 @@ class RecordingBlocks:
         order.check_left_out_rows()
 
     def _note_progress(self, done: int, total: int) -> None:
-        """Keep how much of the file is read, and tell it."""
+        """Keep how much of the file is read, and of how much; tell it to the caller's `progress` if there is one."""
         self._done, self._total = done, total
         if self._progress is not None:
             self._progress(done, total)
@@ -115,7 +117,7 @@ class RecordingBlocks:
 
 
 def cut_recordings(parts: Iterable[Recording], rows: int) -> Iterator[Recording]:
-    """Yield a recording that comes in parts in blocks of so many rows, of which the last may have fewer."""
+    """Yield a recording, which comes in parts of any lengths, in blocks of `rows` rows; the last may have fewer."""
     held, count = list[Recording](), 0  # what was not yielded yet, and its rows
     for part in parts:
         held.append(part)
@@ -136,6 +138,7 @@ def _join_recordings(parts: list[Recording]) -> Recording:
     if len(parts) == 1:
         return parts[0]
     measurements = {node: np.concatenate([part.measurements[node] for part in parts]) for node in parts[0].measurements}
+    # Fields 1 and 2 of a recording are its inputs and times.
     inputs, time = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
     truth = None if parts[0].truth is None else np.concatenate([np.asarray(part.truth) for part in parts])
     return Recording(measurements, inputs, time, truth)

@@ -22,12 +22,13 @@ class RowRefusals:
     """
 
     def __init__(self, source: str, numbers: np.ndarray, strict: bool):
+        """Begin with all rows good; `numbers`: of the rows in the file; `strict`: the first refusal is an error."""
         self.source, self.numbers, self._strict = source, numbers, strict
         self.good = np.ones(len(numbers), dtype=bool)
         self.refused = list[InputError]()
 
     def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
-        """Refuse the rows of a mask, unless they were refused before.
+        """Refuse the rows of a mask, unless they were refused before: `self.good`, (rows,), marks those that were not.
 
         Args:
             bad: the mask, (rows,).
@@ -99,6 +100,7 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
         uses.update([*components, *(f"{node}.{name}" for name in components)])
 
     def list_allowed(node: str, name: str) -> tuple[str, ...]:
+        """Return the names that a node's component may have as a column; `uses`: for how many things a name stands."""
         full = f"{node}.{name}"
         if uses[name] > 1:
             return (full,)
@@ -108,7 +110,10 @@ def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
 
 
 def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
-    """Raise one line with the closest known name if a column belongs to nothing of the network."""
+    """Raise one line with the closest known name if a column belongs to nothing of the network.
+
+    `expected`: for each thing of the network the names that its column may have, the preferred one first.
+    """
     known = [name for names in expected for name in names]
     for column in columns:
         if column not in known:
@@ -119,7 +124,7 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
 
 
 def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
-    """Return which of these names a column has; raise unless exactly one does."""
+    """Return the one of these names, all for the same thing, that a column has; raise if none does, or several."""
     present = [name for name in names if name in columns]
     if len(present) != 1:
         came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
@@ -128,7 +133,7 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
 
 
 def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the times of the rows, dates where the column holds dates."""
+    """Return the times of the rows, numbers, or dates where the column holds dates; rows without one are refused."""
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
         return _read_column_without_gaps(columns, name, refusals)
@@ -137,14 +142,17 @@ def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefus
 
 
 def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the numbers of a column in which every cell has to have one."""
+    """Return the numbers of a column in which every cell has to have one; rows without a finite one are refused.
+
+    Integers stay such, since they may be larger than doubles hold exactly.
+    """
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
     refusals.refuse(~np.isfinite(values), name, "a finite number", _describe_cell(values))
     return values
 
 
 def _read_measurements(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the numbers of a column, NaN where a cell is empty."""
+    """Return the numbers of a column, NaN where a cell is empty; rows with an infinite one are refused."""
     values = _read_numbers(columns, name, refusals.source)
     refusals.refuse(np.isinf(values), name, "a finite number, or none where it did not arrive", _describe_cell(values))
     return values

@@ -32,6 +32,7 @@ class RecordingRows(NamedTuple):
 
 def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
     """Return the rows of several parts of a table, one after the other."""
+    # The fields after numbers and time are dictionaries of columns by name.
     named = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
         for i in range(2, len(RecordingRows._fields))
@@ -89,13 +90,19 @@ class RowsWithMissing(NamedTuple):
     arrived: np.ndarray
 
     def fill(self, values: np.ndarray) -> np.ndarray:
-        """Return values of these rows, NaN where one did not arrive."""
+        """Return values of these rows, NaN where one did not arrive; `values`: of the rows that were read.
+
+        `self.read_row`: for each row the index of the one read that it is, or that is before it.
+        """
         filled = np.array(values[self.read_row], dtype=np.float64)
         filled[~self.arrived] = np.nan
         return filled
 
     def fill_times(self, time: np.ndarray) -> np.ndarray:
-        """Return the times of these rows, those of rows that did not arrive at equal steps between the others."""
+        """Return the times of these rows, those of rows that did not arrive at equal steps between the others.
+
+        `time`: of the rows that were read; `self.read_row`: for each row the index of the one read at or before it.
+        """
         missing = np.flatnonzero(~self.arrived)
         filled = np.array(time[self.read_row])
         # t = t_before + share (t_after - t_before), between the rows that arrived before and after it.
@@ -110,7 +117,8 @@ class RowsWithMissing(NamedTuple):
 def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -> RowsWithMissing:
     """Return the rows with these numbers; where each row is a step also those between them, as the row before each.
 
-    Steps begin with the row of number `first`.
+    The result says of each row its number, the index of the row read that it is or that is before it, and whether it
+    was read itself. Steps begin with the row of number `first`; without an input dt each row is a step.
     """
     if TIME_STEP in network.inputs or not len(numbers):
         return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))

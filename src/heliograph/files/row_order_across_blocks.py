@@ -35,6 +35,10 @@ class BlockOrderCheck:
     """
 
     def __init__(self, path: Path, network: Network):
+        """Begin with no row; rows are steps where the network has no input dt.
+
+        `_first` and `last`: the first row that stays of all blocks, and the newest.
+        """
         self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
         self.last: RecordingRows | None = None
         self._first: RecordingRows | None = None
@@ -77,7 +81,9 @@ class BlockOrderCheck:
             self._left_out.append(left_out.select(np.array([np.argmin(left_out.time), np.argmax(left_out.time)])))
 
     def check_left_out_rows(self) -> None:
-        """Check that all rows that blocks left out are more than a year outside of all that stay.
+        """Check that all rows that blocks left out have times more than a year before or after all that stay.
+
+        Whether such a row is to be left out only all rows together say, so that blocks may have been wrong.
 
         Raises:
             RowsNotInBlocksError: one that is not.
@@ -85,6 +91,7 @@ class BlockOrderCheck:
         if self._first is None or self.last is None:
             return
         first, last = self._first.time[0], self.last.time[0]
+        # Of each block the two rows left out with the least and the greatest time speak for all that it left out.
         year = _year_in_unit_of(self._first.time)
         for rows in self._left_out:
             for row in range(2):

@@ -35,7 +35,10 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
 
 
 def _suggest_options(topic: TopicStatistics, dated: bool) -> str:
-    """Return a source's options for a topic's time and count; `dated`: whether there are dates in any topic."""
+    """Return the text of a source's options for a topic's time field and running count, as code; "" if it has none.
+
+    `dated`: whether there are dates in any topic.
+    """
     options = ""
     if topic.time is not None:
         options += f", time={_write_time_option(topic, dated)}"
@@ -57,7 +60,10 @@ def _write_count_option(topic: TopicStatistics, path: str) -> str:
 
 
 def _comment_on_unit(topic: TopicStatistics, path: str, mark: str = "  #") -> str:
-    """Return the unit of a field as a comment, "" if the file names none; of degrees, what makes them radians."""
+    """Return the unit of a field as a comment of Python, "" if the file names none; of degrees with the remedy.
+
+    DEGREES are the ways to write that unit; angles in the network are in radians.
+    """
     if path not in topic.measured_in:
         return ""
     unit = topic.measured_in[path]

@@ -109,7 +109,7 @@ def read_table(path: str | Path) -> dict[str, Shaped[np.ndarray, " rows"]]:
 
 
 def read_rows(path: Path, only: Container[str] | None, strict: bool) -> TableRows:
-    """Read the rows of a file, or those of its columns that are among `only`.
+    """Return the rows of a file, of all columns or of those among `only`.
 
     Raises:
         ValueError: what `read_table` refuses; where reading is not strict, a row alone is none of that.

@@ -21,6 +21,7 @@ class TableRows(NamedTuple):
 def join_rows(parts: Iterable[TableRows]) -> TableRows:
     """Return the rows of several parts of a table, one after the other."""
     parts = list(parts)
+    # Parts without rows do not say of which kind their columns are, and count only where there is nothing else.
     filled = [part for part in parts if len(part.numbers)] or parts[-1:]
     names = filled[0].columns if filled else ()
     columns = {name: _join_column([part.columns[name] for part in filled]) for name in names}

@@ -41,11 +41,11 @@ def open_table(path: Path) -> Iterator[Append]:
 
 @contextmanager
 def _open_csv(path: Path) -> Iterator[Append]:
-    """Open a file of CSV."""
+    """Open a new file of CSV; yields a function that appends rows."""
     with path.open("x", newline="", encoding="utf-8") as file:
 
         def append(columns: Mapping[str, np.ndarray]) -> None:
-            """Append rows, behind the names of the columns in the first line."""
+            """Append rows to `file`, which gets the names of the columns first while it is empty."""
             if not file.tell():
                 check_distinct(f"columns of {path}", [predict_name_read_back(name) for name in columns])
                 csv.writer(file).writerow(map(quote_for_cell, columns))
@@ -62,7 +62,7 @@ def _open_parquet(path: Path) -> Iterator[Append]:
     writer: pq.ParquetWriter | None = None
 
     def append(columns: Mapping[str, np.ndarray]) -> None:
-        """Append rows."""
+        """Append rows; the first ones make the `writer` of the file, with their columns."""
         nonlocal writer
         rows = _make_arrow_table(columns)
         if writer is None:
@@ -77,7 +77,7 @@ def _open_parquet(path: Path) -> Iterator[Append]:
 
 
 def _make_arrow_table(columns: Mapping[str, np.ndarray]) -> "pa.Table":
-    """Return columns as a table of Arrow."""
+    """Return columns as a table of Arrow, the form in which Parquet is written; dates are in UTC."""
     import pyarrow as pa
 
     arrays = {name: pa.array(np.ascontiguousarray(c)) for name, c in columns.items()}
@@ -86,7 +86,7 @@ def _make_arrow_table(columns: Mapping[str, np.ndarray]) -> "pa.Table":
 
 
 def _write_csv_rows(columns: Mapping[str, np.ndarray], file: TextIO) -> None:
-    """Write rows as lines, a block of them at a time."""
+    """Write rows as lines, a block of BLOCK rows at a time, whose cells alone are in memory as texts."""
     for start in range(0, len(next(iter(columns.values()))), BLOCK):
         cells = [_format_cells(column[start : start + BLOCK]) for column in columns.values()]  # they need no quotes
         file.writelines(f"{','.join(row)}\r\n" for row in zip(*cells, strict=True))

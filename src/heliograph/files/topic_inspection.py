@@ -90,7 +90,8 @@ class TopicStatistics:
     def choose_time_field(self) -> None:
         """Take for the time of the messages the first date that is not the same in all of them, or else the first.
 
-        Without dates it is the first clock by name that never goes back; its messages were logged when it says.
+        Without dates it is the first clock by name that never goes back; its messages were logged when it says. A date
+        has its moments, in nanoseconds since 1970, and by how many seconds messages came later.
         """
         if self.time is not None:
             return
@@ -103,7 +104,10 @@ class TopicStatistics:
         self.logged = self.logged or moments
 
     def _choose_clock_field(self) -> None:
-        """Take for the time the first clock that has a number in every message and never goes back, if there is one."""
+        """Take for the time the first clock that has a number in every message and never goes back, if there is one.
+
+        Not where it is known when messages were logged. UNITS: nanoseconds of each unit.
+        """
         for path, numbers in self.clocks.items() if not self.logged else ():
             if len(numbers) == self.messages > 1 and numbers[0] < numbers[-1] and np.all(np.diff(numbers) >= 0):
                 unit = _read_unit_of_clock_name(path)
@@ -125,7 +129,7 @@ class TopicStatistics:
         """Return type, count, rate, largest gap and lateness (median, 95 %, largest), as text."""
         self.choose_time_field()
         times = np.sort(np.array(self.logged, dtype=np.int64))
-        apart = np.diff(times) / SECOND
+        apart = np.diff(times) / SECOND  # seconds
         span = float(apart.sum())
         rate = f"{len(apart) / span:.3g} Hz" if span > 0 else "-"
         count = f"{max(len(times), self.messages)}"  # some may have come at a time that is not known
@@ -174,7 +178,10 @@ def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: P
 
 
 def _describe_type(reader: "AnyReader", kind: str) -> TopicStatistics:
-    """Return a topic of messages of a type of ROS: its fields of numbers, and its stamp, which only ROS 2 has first."""
+    """Return a topic of messages of a type of ROS: its fields of numbers, and the stamp of its header, of ROS 2 alone.
+
+    In ROS 1 a message does not begin with the stamp, by which it could be read without decoding.
+    """
     fields = list(list_fields(reader, kind))
     numbers = [name for name, basic in fields if basic not in NO_NUMBERS and not name.startswith("header.")]
     has_stamp = any(name == f"{STAMP}.sec" for name, _ in fields) and reader.is2
@@ -195,7 +202,7 @@ def _inspect_mcap(path: Path, topics: dict[str, TopicStatistics]) -> str:
 
 
 def note_payload(topics: dict[str, TopicStatistics], name: str, payload: str | bytes, arrival: int) -> None:
-    """Add a message of a broker to its topic; `arrival` is in nanoseconds since 1970."""
+    """Add a message of a broker to its topic `name`, whether it is JSON or not; `arrival`: nanoseconds since 1970."""
     try:
         _note_message(topics, name, decode_json(payload, name), "JSON", arrival)
     except InputError:
@@ -251,7 +258,7 @@ def _match_clock_name(path: str) -> re.Match[str] | None:
 
 
 def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
-    """Return the unit that the name of a clock ends in; seconds where it has none."""
+    """Return the unit that the name of a clock ends in, as "uptime_ms"; seconds where it has none."""
     match = _match_clock_name(path)
     unit = None if match is None else match["unit"]
     return next((known for known in UNITS if known == unit), "s")
@@ -263,7 +270,10 @@ def _is_clock_from_start(path: str, value: float) -> bool:
 
 
 def _find_unit_of_date(value: object) -> TimeUnit | None:
-    """Return the unit in which a number, counted from 1970, is a date of these years; None of any other value."""
+    """Return the unit in which a number, counted from 1970, is a date of 2000 to 2044 (YEARS); None of any other value.
+
+    UNITS: nanoseconds of each unit.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return next((unit for unit, size in UNITS.items() if YEARS.start <= value * size / SECOND < YEARS.stop), None)
@@ -339,7 +349,10 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
 
 
 def _rank_field(path: str) -> int:
-    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1."""
+    """Return how little a field looks like a measurement: 0 under a payload, 2 for a device's own state, else 1.
+
+    HOUSEKEEPING matches words of the latter, such as a battery's; PAYLOADS are names of what holds measurements.
+    """
     words = path.lower().split(".")
     if any(HOUSEKEEPING.fullmatch(word) for word in words):
         return 2
@@ -356,7 +369,10 @@ def _read_stamp(data: bytes) -> int:
 
 
 def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
-    """Yield dotted path and value of what is no dictionary or list in decoded JSON, and of stamps."""
+    """Yield dotted path and value of what is no dictionary or list in decoded JSON, and of stamps.
+
+    A stamp is a dictionary of seconds and nanoseconds; `depth`: how many dictionaries deep it looks.
+    """
     if isinstance(content, dict) and depth and not is_stamp(content):
         for key, value in content.items():
             yield from _yield_leaves(value, f"{prefix}{key}.", depth - 1)

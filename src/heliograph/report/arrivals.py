@@ -61,10 +61,11 @@ class Arrivals:
 
     @cached_property
     def rate(self) -> SendingRate | None:
-        """The mean rate of a sender whose clock is not that of the rows; None where a pattern of rows explains as much.
+        """Return the rate of a sender whose clock is not that of the rows; None where a pattern of rows does as well.
 
-        None too where its period is declared, and where rows are messages. Of rate and pattern the one that says that
-        fewer messages were due explains more.
+        A pattern is due in the same few of each so many rows; `arrived`: whether a message came in each row. None too
+        where the sender's period is declared, and where rows are there because messages are. Of rate and pattern the
+        one that says that fewer messages were due explains more.
         """
         if self.declared_period is not None or self.of_messages:
             return None
@@ -136,7 +137,7 @@ class Arrivals:
 
     @property
     def due_in(self) -> str:
-        """The rows or times in which it is due, in words."""
+        """Return in words the rows or times in which it is due: each slot (a row, or a period), or a pattern's."""
         if self.slots is None:
             return "not known"
         some = "" if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
@@ -180,12 +181,12 @@ class Arrivals:
         return np.nan if self.due is None else min(float(self.arrived.sum()) / self.due, 1.0)
 
     def contradicts(self, level: float) -> bool:
-        """Test at a level whether the share that arrived is another than the stated one, and by more than a hundredth.
+        """Return whether, tested at a level, the share that arrived is not the stated one, by more than a hundredth.
 
         Arrivals that come in bursts say as much as fewer independent ones, N (1 - a) / (1 + a) with the correlation a
         of each with the next.
         """
-        p = self.stated_share
+        p = self.stated_share  # probability of arrival that the network states; due_slots: whether each message came
         if p is None or self.due_slots is None or not 0 < p < 1:
             return False
         arrived = self.due_slots.astype(float)
@@ -195,7 +196,7 @@ class Arrivals:
 
     @property
     def longest_gap(self) -> int | None:
-        """Greatest number of messages in a row that were due and did not arrive; None where nobody knows."""
+        """Return the most messages in a row that were due and did not arrive; None where nobody knows what was due."""
         if self.due_slots is None:
             return None
         # As if a message had come before the first and after the last.
@@ -204,7 +205,7 @@ class Arrivals:
 
 
 def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
-    """Test whether rows are there because messages are: something arrived at each time, mostly of one node alone.
+    """Return whether rows are there because messages are: something arrived at each time, mostly of one node alone.
 
     Args:
         arrived: by node, whether anything of it arrived at each time.
@@ -231,7 +232,10 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     time, time_of_row = np.unique(times, return_inverse=True)
 
     def by_time(in_row: np.ndarray) -> np.ndarray:
-        """Return whether something is true in any row of each distinct time."""
+        """Return for each distinct time of `time` whether `in_row` is true in any row of it.
+
+        `time_of_row`: index of each row's time.
+        """
         at_time = np.zeros(len(time), dtype=bool)
         at_time[time_of_row[in_row]] = True
         return at_time
@@ -280,7 +284,10 @@ class _DeclaredSending(NamedTuple):
 
 
 def _read_declared_sending(receiver: Any) -> _DeclaredSending:
-    """Return what the network says of a node's messages."""
+    """Return what the network says of a node's messages: period, whether they may be lost, and shares that arrive.
+
+    The period is in steps, None where it says none; shares are by received number, None where they are not constant.
+    """
     if not isinstance(receiver, Node):
         return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
     shares = _find_arrival_probabilities(receiver)
@@ -294,7 +301,7 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number; None of a link whose losses remember or change.
 
-    None too where the sender decides when to send.
+    None too of a link that loses nothing, and where the sender decides when to send.
     """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

@@ -42,7 +42,7 @@ class ConstantError(NamedTuple):
     nothing_else: bool = False
 
     def __str__(self) -> str:
-        """Return the output and its error, such as "c: y, of 0.93 ± 0.04"."""
+        """Return the output, or those it may be, and its error with half the 95 % interval: "c: y, of 1.0 ± 0.2"."""
         half = 1.96 * self.standard_error
         size = f"{round_to(self.error, self.standard_error)} ± {round_to(half, self.standard_error)}"
         return f"{' or '.join(self.outputs)}, of {size}"

@@ -14,7 +14,10 @@ def _format_outputs_and_sizes(outputs: Sequence[str], sizes: Sequence[float]) ->
 
 
 def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval."""
+    """Return the sentence on a filter whose NIS, the innovations squared over their variance, is above its interval.
+
+    `sizes`: for each of `outputs` how many times larger the squares are than their claim.
+    """
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} is too sure{of}: the mean square of its innovations is {times} times what it claims; the model leaves "
@@ -23,7 +26,10 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
 
 
 def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
-    """Return the sentence on innovations that are correlated in time."""
+    """Return the sentence on innovations that are correlated in time; `test` has their correlation at each lag.
+
+    `test.predictable`: share of their variance that those before predict.
+    """
     return (
         f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
         f"last, {test.predictable:.0%} of their variance follows from {len(test.correlation)}); "
@@ -34,7 +40,10 @@ def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
 
 
 def say_constant_error(name: str, off: ConstantError) -> str:
-    """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it."""
+    """Return the sentence on the output whose constant error leaves nothing else doubtful, or explains most of it.
+
+    `off.explained`: share of what the filter's squared innovations are too large by.
+    """
     if not off.nothing_else:
         share = f"{min(off.explained, 0.99):.0%} of what its squared innovations are too large by"
         return f"{name}: a constant error of {off}, would explain {share}, not all"
@@ -63,7 +72,10 @@ def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
 
 
 def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
-    """Return what to do about an output that repeats a value: that it was refused, or how to have it refused."""
+    """Return what to do about an output that repeats a value: that it was refused, or how to have it refused.
+
+    `held.stuck`: for how many readings it may repeat one before the option of that name refuses it.
+    """
     if refused:
         return "what repeated for longer was refused"
     return (

@@ -15,7 +15,8 @@ def compute_expected_squares(
 ) -> Float[np.ndarray, "steps m"]:
     """Return the mean square of each innovation given its recording, over its variance over all runs: 1 for most.
 
-    Behind random gains the two differ, as the state of this run differs from its mean over all runs.
+    Behind random gains the two differ, as the state of this run differs from its mean over all runs: `given_record` is
+    there another filter, with covariances given its data, and elsewhere the filter itself.
     """
     conditioned = filter.given_record()
     if conditioned is filter:
@@ -48,7 +49,10 @@ def compute_ratio_of_squares(
 def scale_size_to_expected(
     test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
 ) -> MemoryTest:
-    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1."""
+    """Return the test with the size of innovations relative to what is `expected` in this recording, where not 1.
+
+    `white`: innovations in units of their claimed deviations, NaN where none came; `expected`: their mean squares.
+    """
     if np.all(expected == 1):
         return test
     there = ~np.isnan(white)

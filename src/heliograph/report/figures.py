@@ -52,7 +52,7 @@ def make_stacked_panels(count: int, height: float, margin: float, sharex: bool =
 
 
 def place_legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
-    """Place the legend of `axes` above all panels."""
+    """Place the legend of `axes` above all panels, in at most so many columns."""
     handles, names = axes.get_legend_handles_labels()
     legend = axes.get_legend()
     if legend is not None:
@@ -99,7 +99,7 @@ def svg(figure: Figure) -> bytes:
     buffer, before = BytesIO(), figure.dpi
     figure.set_facecolor("white")
     _rasterise_dense(figure)
-    figure.dpi = RASTER
+    figure.dpi = RASTER  # of the parts that are pixels
     canvas: Any = FigureCanvasSVG(figure)
     canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     figure.dpi = before

@@ -83,6 +83,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
     headers, columns = ["time"], [format_times(forecast.time[rows])]
     for kind, prediction in predictions:
         claims = prediction.claim != "none"
+        # Without a claim the deviation is NaN, by which the cell shows the mean alone.
         low, high = prediction.interval(BOTH_SIDES) if claims else (prediction.mean, prediction.mean)
         for i, number in enumerate(prediction.names):
             headers.append(visible(f"{kind}{number}"))
@@ -93,7 +94,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
 
 
 def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
-    """Return the mean and interval in words, to two digits of the deviation."""
+    """Return mean and interval in words, to two digits of the standard deviation; the mean alone if that is NaN."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"

@@ -25,7 +25,10 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 
 def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
-    """Return the filters in each figure of innovations by its name: one of all, or one of each node of many."""
+    """Return {name of a figure of innovations: its filters}: one figure of all, or of more than FEW filters one a node.
+
+    At most MOST nodes are drawn. `filter.white`: innovations in units of their claim, None of a filter without a test.
+    """
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
         return {"innovations": tested} if tested else {}
@@ -193,7 +196,11 @@ def _make_declared_table(health: Health) -> list[Table]:
 
 
 def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
-    """Return the cells of each class of declared variances: its range, how many values, size, and scale or "–"."""
+    """Return the cells of each class of messages that declare about the same variance: range, values, size, scale.
+
+    Size: mean squared innovation over its variance, with its interval; scale: the best factor of the declared variances
+    with its interval, "–" where it has none.
+    """
     rows = []
     for of_class in judgement.classes:
         is_single = of_class.low == of_class.high
@@ -220,7 +227,7 @@ def name_undrawn_figures(names: Sequence[str], where: str) -> list[Text]:
 
 
 def label_time_axis(record: Record, axes: Axes) -> None:
-    """Write the name of time, with its unit in the record, at the axis."""
+    """Write the name of time at the axis, with its unit if the record has one; times that are dates are in UTC."""
     if record.time.dtype.kind == "M":
         axes.set_xlabel("time (UTC)")
     else:

@@ -13,9 +13,9 @@ PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
 
 
 def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
-    """Return by name a figure of the modes at each node with a filter that weighs modes.
+    """Return by name a figure of the modes' probabilities at each node with a filter that weighs modes.
 
-    Its name is "modes_", `kind` and the node's number.
+    Its name is "modes_" (PREFIX), `kind` and the node's number.
     """
     has_modes = [any(e.modes is not None for e in record.estimates[node].values()) for node in nodes]
     return {f"{PREFIX}{kind}_{i}": _draw_modes(record, node) for i, node in enumerate(nodes) if has_modes[i]}

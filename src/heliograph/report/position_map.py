@@ -19,7 +19,10 @@ SIGMAS = 2.0
 
 
 def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
-    """Return the indices of two states that are a position in a plane, by their names; None where there are none."""
+    """Return the indices of two states that are a position in a plane, by their names; None where there are none.
+
+    PAIRS are such names, as ("x", "y"); a unit in brackets behind a name does not count.
+    """
     plain = [state.split("(")[0].strip().lower() for state in states]
     for first, second in PAIRS:
         if first in plain and second in plain:

@@ -213,7 +213,10 @@ class Health:
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
     def explains_all_innovations(self, health: FilterHealth, off: ConstantError) -> bool:
-        """Return whether innovations without the effect of a constant error are as large as claimed, without memory."""
+        """Return whether innovations without the effect of a constant error are as large as claimed, without memory.
+
+        `off.squares`: these squared, over their variances, NaN where none came; `off.white`: they, over deviations.
+        """
         level = self._level_of_one_test() / off.squares.shape[1]
         for column in off.squares.T:
             numbers = int(np.count_nonzero(~np.isnan(column)))
@@ -227,7 +230,8 @@ class Health:
 
         Of N numbers that know nothing of one another each lag seems to predict 1 / N of the variance.
         """
-        # A filter's gains suit the mean over all runs: in a run that is far from it they are too large or too small.
+        # A filter's gains suit the mean over all runs: in a run whose mean square innovation, relative to that over all
+        # runs (`expected`), is further from 1 than TYPICAL they are too large or too small.
         if abs(np.log(health.expected)) > np.log(TYPICAL):
             return False
         by_chance = len(test.correlation) / health.numbers if health.numbers else 0.0
@@ -244,7 +248,7 @@ class Health:
 
 
 def judge_size(size: float, error: float, numbers: int, level: float) -> int:
-    """Return 1 or -1 where a mean square of so many numbers is off its claim by its interval and by a tenth; else 0.
+    """Return 1 (too large) or -1 where a mean square is off its claim, 1, by its interval and by a tenth; else 0.
 
     The logarithm of a mean square is nearly Gaussian, with its relative error; one that came out small has a small
     error too. An error that a few numbers tell is itself known to some 1 / sqrt(2 N), so that it counts no less than
@@ -332,7 +336,7 @@ def _examine_filter(
 
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Return the sentence that times are in another unit, by the first filter that is doubtful; else ""."""
+    """Return the sentence that times seem to be in another unit, by the first doubtful filter; "" if they do not."""
     tested = [judged for judged in health.doubted() if judged.test is not None]
     if not tested:
         return ""
@@ -349,7 +353,7 @@ def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) 
 def _find_constant_error(
     network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
 ) -> ConstantError | None:
-    """Return the constant error of one output that explains what is doubtful in a filter of several; else None."""
+    """Return the constant error of one output that explains all or MOST of what is doubtful in a filter; else None."""
     if judged.test is None:
         return None
     listener = _find_judged_filter(network, health.record, judged)
@@ -387,7 +391,7 @@ def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "ste
 
 
 def _test_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
-    """Test the innovations of one filter, from each message to the next; None of too few, or of nothing but zeros."""
+    """Return the test of innovations' correlation from message to message; None of too few (LAGS: 10), or all zeros."""
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):

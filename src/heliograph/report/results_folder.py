@@ -75,6 +75,7 @@ def write_results(
 
 def write_into_folder(results: ResultsContent, folder: Path) -> None:
     """Write figures, report, data and summary into a folder that is there."""
+    # The SVG pictures come first: drawing them lays the figures out, for the PNG files too.
     from heliograph.report.figures import png, svg
 
     pictures = {name: svg(figure) for name, figure in results.figures.items()}

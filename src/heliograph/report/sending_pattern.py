@@ -23,8 +23,9 @@ class SendingPattern(NamedTuple):
 def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
     """Return the pattern of rows in which a message is due, if losses at random would hardly leave it; else None.
 
-    What is due in some of each `length` rows leaves the other rows empty for ever. Of the messages that are due some
+    What is due in `due` of each `length` rows leaves the other rows empty for ever. Of the messages that are due some
     may be lost: what arrives in the due rows is looked at again, so that the pattern is the finest that can be told.
+    `rows`: mask of the due rows; `places`: one of a pattern's length, which of the rows looked at are due.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
     while (places := _find_least_probable_rows(arrived[rows])) is not None:
@@ -70,7 +71,10 @@ class BurstLossLaw(NamedTuple):
 
     @staticmethod
     def fit_to_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "BurstLossLaw":
-        """Return the law of the greatest likelihood: shares of arrivals after an arrival, and of losses that end."""
+        """Return the law of the greatest likelihood: shares of arrivals after an arrival, and of losses that end.
+
+        An interval of 1 is an arrival in the row after one; of k > 1 it has k - 1 losses, the last of which ends them.
+        """
         losses = intervals[intervals > 1] - 1
         return BurstLossLaw(
             follows=1 - len(losses) / max(len(intervals), 1),
@@ -85,6 +89,7 @@ class BurstLossLaw(NamedTuple):
         later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1); for each z the chance is at most
         stay(first) / z^count (Chernoff). The best z is about the share of the rows that are not due, inverted.
         """
+        # z = share^-exponent, where a share of 1 / n at least keeps z finite.
         share = max(float(np.mean(due)), 1 / len(due))
         return min(self._log_mean_of_powers(due, -exponent * log(share), count) for exponent in (0.0, 0.5, 1.0))
 
@@ -130,7 +135,10 @@ def _bound_log_chance(places: Bool[np.ndarray, " length"], law: BurstLossLaw, co
 
 
 def _compute_log_row_sum(matrix: Float[np.ndarray, "n n"], exponent: int) -> float:
-    """Return the logarithm of the largest row sum of M^exponent, by squares that are scaled to a sum of 1."""
+    """Return the logarithm of the largest row sum of M^exponent, by repeated squares, scaled so that none underflows.
+
+    `sums`: row sums of the powers taken so far over exp(logarithm); `matrix`: M^(2^k) over exp(scale).
+    """
     sums, logarithm, scale = np.ones(len(matrix)), 0.0, 0.0
     while exponent:
         if exponent % 2:

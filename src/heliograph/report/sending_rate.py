@@ -44,6 +44,7 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
     A sender that is due each T rows, T no whole number, comes in the rows r where frac(r / T - phase) < 1 / T, and all
     others are empty for ever (frac is the part after the point). If it is hardly slower than the rows the empty ones
     are rare, and have a rate themselves: one of each 1 / (1 - 1 / T) rows, and no such slot without its empty row.
+    `slots`: of each arrival its number among those that were due.
     """
     rate = _find_slowest_rate(arrived)
     if rate is not None:
@@ -92,7 +93,7 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
 def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
     """Return frequencies to look at, in periods a row: of usual intervals, and of the largest peaks of the spectrum.
 
-    A spectrum does not tell a frequency f from 1 - f: both are returned.
+    Of the spectrum of what arrived the PEAKS (8) largest count. It does not tell f from 1 - f: both are returned.
     """
     intervals = np.diff(np.flatnonzero(arrived))
     # The next power of two, times four: the zeros behind the data make the frequencies of the spectrum close.
@@ -106,7 +107,10 @@ def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
 
 
 def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> tuple[float, float]:
-    """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls."""
+    """Return middle and length of the largest part of a period, as a circle of length 1, in which no arrival falls.
+
+    `frequency`: periods a row; `rows`: of the arrivals.
+    """
     phases = np.sort(np.mod(frequency * rows, 1))
     gaps = np.diff(phases, append=phases[0] + 1)  # the last one goes around the circle, to the first phase
     largest = int(np.argmax(gaps))

@@ -162,6 +162,7 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
     """
     # Names of the filters whose estimates a fusion joins, in a centre or among neighbours.
     fused = {fusion.filter for fusion in (network.fused | network.meshes).values() if isinstance(fusion, Fusion)}
+    # STRENGTH orders claims, from "none" to "exact".
     relied_on = {}
     for node, receiver in network.nodes.items():
         strengths = {name: STRENGTH[filter.claim] for name, filter in receiver.filters.items()}
@@ -171,7 +172,8 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
 
 
 def weighs(filter: AbstractFilter) -> bool:
-    """Return whether a filter weighs the components of what arrives."""
+    """Return whether a filter weighs the components of what arrives by how likely they are, as one against outliers."""
+    # Only the shape of a correction is looked at, nothing is computed: without weighing its weight is None.
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
         innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
@@ -282,6 +284,7 @@ class RecentInnovations:
     """
 
     def __init__(self, rows: int, names: Mapping[tuple[str, str], Sequence[str]]):
+        """Begin with no row; `rows`: how many newest ones are kept; `names`: of outputs, by node and filter."""
         self.names = names
         self._rows: dict[tuple[str, str], deque[np.ndarray]] = defaultdict(lambda: deque(maxlen=rows))
         self.left_out = Counter[tuple[str, str]]()  # by node and filter: numbers of weight 0, of all rows so far
@@ -290,7 +293,7 @@ class RecentInnovations:
         """Add a row: innovations `value`, their `variance` and the `weight` of each number, None where none arrived."""
         row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
-        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])
+        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])  # None, not arrived, is not 0
 
     def summarise_outputs(self) -> list[OutputHealth]:
         """Return what the newest rows of each filter say of each of its outputs."""
@@ -309,6 +312,7 @@ class RecentInnovations:
 
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
     """Return what the innovations of all filters that weigh what arrives say of each output of a recording."""
+    # Without inputs (the empty array): the record has these filters' innovations, so that none is run again.
     outputs: list[OutputHealth] = []
     for listener in yield_filters_with_measurements(network, record):
         if listener.name in record.weighed.get(listener.node, {}):

@@ -79,7 +79,7 @@ class StuckValue(NamedTuple):
     stuck: int
 
     def __str__(self) -> str:
-        """One line, such as "400 equal values (3.2) from row 1200"."""
+        """Return one line, such as "400 equal values in a row (3.2) from row 1200"; rows count from 1 here."""
         if self.readings == self.received:
             return f"all {self.readings} values are {self.value:g}"
         return f"{self.readings} equal values in a row ({self.value:g}) from row {self.first_row + 1}"

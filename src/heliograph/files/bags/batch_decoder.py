@@ -54,7 +54,9 @@ class MessageLayout:
     def __init__(self, definitions: Any, kind: str, data: bytes, paths: set[str]):
         """Find where the fields at `paths` stand in messages laid out as `data`; LayoutNotFixedError if one cannot be.
 
-        `definitions`: fields of each type of messages; `kind`: type of this one.
+        `definitions`: fields of each type of messages; `kind`: type of this one. `self.lengths` gets the length of each
+        text or list by the byte where it stands, in byte 0 what must be the HEAD of the encoding; `self.fields` gets
+        by path the byte of a wanted number and its type.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
         self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
@@ -64,7 +66,10 @@ class MessageLayout:
             raise LayoutNotFixedError  # a message is filled up to four bytes at most
 
     def fits(self, table: np.ndarray) -> np.ndarray:
-        """Return whether each message of a table of bytes, (messages, size), has these lengths, (messages,)."""
+        """Return whether each message of a table of bytes, (messages, size), has the layout's lengths, (messages,).
+
+        `self.lengths`: by the byte where one stands the length of a text or list, and in byte 0 the head of CDR.
+        """
         fits = np.ones(len(table), dtype=bool)
         for begin, length in self.lengths.items():
             fits &= _decode_column(table, begin, "uint32") == length
@@ -77,7 +82,8 @@ class MessageLayout:
     def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
         """Note where the wanted numbers of a message stand that begins at byte `begin`; return where it ends.
 
-        `prefix`: path of the message in the whole one, with a dot; "" for that itself.
+        `prefix`: path of the message in the whole one, with a dot; "" for that itself. LayoutNotFixedError, here and
+        below, means that the message has no fixed places and is decoded alone.
         """
         if kind not in self._definitions:  # a type that the bag does not describe, as "wstring"
             raise LayoutNotFixedError
@@ -118,7 +124,11 @@ class MessageLayout:
         return begin
 
     def _locate_numbers_in_row(self, begin: int, kind: str, count: int, names: list[str]) -> int:
-        """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last."""
+        """Note where the wanted ones of `count` numbers in a row stand, by `names`; return the byte behind the last.
+
+        `kind`: type of the numbers, such as "uint16"; NUMBERS has the bytes of each. Every number begins at a multiple
+        of its size.
+        """
         size = NUMBERS.get(kind)
         if size is None:
             raise LayoutNotFixedError
@@ -129,7 +139,11 @@ class MessageLayout:
         return begin + count * size
 
     def _note_length(self, begin: int) -> int:
-        """Return the length that stands at this byte, and note it: messages of the layout all have it there."""
+        """Return the length of a text or list that stands at this byte, and note it: the whole layout has it there.
+
+        Messages with more lengths than MOST_LENGTHS, or one beyond their end, are decoded alone. Byte 0 has no length
+        but the head of the encoding.
+        """
         length = int.from_bytes(self._data[begin : begin + 4], "little")
         self.lengths[begin] = length
         if len(self.lengths) > MOST_LENGTHS or (begin and begin + 4 + length > len(self._data)):
@@ -234,7 +248,12 @@ class NodeReadings(NamedTuple):
 
 
 def _list_paths_of_numbers(source: Source) -> list[str]:
-    """Return the numbers that a source needs: its values, both parts of a stamp, its count."""
+    """Return dotted paths of the numbers that a source needs: its values, both parts of a stamp, its running count.
+
+    Raises:
+        LayoutNotFixedError: a source of which each message is decoded alone, since its plant or node stand in the
+            message, a condition (`where`) chooses messages, or times are steps.
+    """
     if source.plant is not None or not isinstance(source.node, str) or source.where or source.time_unit == "step":
         raise LayoutNotFixedError
     stamp = [] if source.time is None else [f"{source.time.path}.{field}" for field in STAMP]
@@ -285,6 +304,8 @@ def _make_node_readings(
 
 def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
     """Return a value of many messages, (messages,): the field at a path, or what is computed of several; NaN for none.
+
+    `columns`: by path of a field its numbers, one a message; those that are not finite are none.
 
     Raises:
         LayoutNotFixedError: a number of one of them that is none of its kind, such as a latitude beyond 90 degrees.

@@ -58,12 +58,15 @@ class Pose:
     child: str = "base_link"
 
     def __post_init__(self) -> None:
+        """Check that each field, the name of the state that is this axis, is a text; None where there is no state."""
         for name, value in vars(self).items():
             if value is not None:
                 text(f"pose, {name}", value)
 
     def places(self, states: tuple[str, ...]) -> tuple[list[int | None], list[int | None]]:
         """Return for each axis of the pose, and of the twist, the index of its state; None where it has none.
+
+        AXES are x, y, z and three angles, six of the pose; those of the twist, velocities, have a "v" before them.
 
         Raises:
             ValueError: an unknown state.
@@ -133,7 +136,10 @@ def _load_ros2_message_types() -> Any:
 
 
 def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
-    """Return times in nanoseconds since 1970: of dates, or of seconds or steps from an origin (None: 1970)."""
+    """Return times in nanoseconds since 1970: of dates, or of seconds from an origin (None: 1970).
+
+    Times that are steps are taken as seconds.
+    """
     if time.dtype.kind == "M":
         return [int(at) for at in time.astype("datetime64[ns]").astype(np.int64)]
     begun = 0 if origin is None else int(origin.astype("datetime64[ns]").astype(np.int64))
@@ -153,7 +159,10 @@ def _make_topic_prefix(node: str, filter_name: str) -> str:
 def _yield_topics_and_types(
     prefix: str, states: tuple[str, ...], claim: Claim, pose: Pose
 ) -> Iterator[tuple[str, str]]:
-    """Yield topic and message type of each part of one filter's estimates."""
+    """Yield topic and message type of each part of one filter's estimates: odometry, each state, its deviation.
+
+    There is odometry where a state is an axis of the pose or twist, and deviations (sd) where the filter claims any.
+    """
     if any(state is not None for places in pose.places(states) for state in places):
         yield f"{prefix}/odometry", ODOMETRY
     for state in states:
@@ -211,7 +220,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
 
 
 def _yield_state_numbers(estimates: _FilterEstimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:
-    """Yield topic and number of each state in row k: its mean, and its deviation if the filter claims one."""
+    """Yield topic and number of each state in row k: its mean, and its standard deviation if the filter claims one."""
     for i, state in enumerate(states):
         topic = f"{estimates.prefix}/{_make_valid_topic_word(state)}"
         yield topic, float(estimates.mean[k, i])
@@ -262,7 +271,7 @@ def _select_pose_and_covariance(
 ) -> tuple[list[float], Float[np.ndarray, " 36"]]:
     """Return the six numbers of pose or twist, and their covariance (36,), row by row; `places`: states by axis.
 
-    Both are 0 on an axis that no state is on.
+    Both are 0 on an axis that no state is on. Where there is no covariance its first entry is UNKNOWN, -1, as in ROS.
     """
     numbers = [0.0 if state is None else float(mean[state]) for state in places]
     covariance_of_axes = np.zeros((6, 6))
@@ -277,6 +286,7 @@ def _select_pose_and_covariance(
 
 def _convert_angles_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Return x, y, z, w of the rotation by yaw about z, then pitch about the new y, then roll about the new x."""
+    # Sines and cosines of half the angles.
     (sr, sp, sy), (cr, cp, cy) = (f(np.array([roll, pitch, yaw]) / 2).tolist() for f in (np.sin, np.cos))
     return (
         sr * cp * cy - cr * sp * sy,

@@ -46,6 +46,8 @@ class ProtobufType(NamedTuple):
 def holds_messages(path: Path) -> bool:
     """Return whether a file is MCAP with messages in JSON or Protocol Buffers.
 
+    OTHERS are the encodings that nothing here reads; a file with messages of ROS has neither and is read elsewhere.
+
     Raises:
         ValueError: MCAP whose messages are all of an encoding that is not read.
     """
@@ -134,9 +136,10 @@ def _yield_stored_messages(path: Path, file: BinaryIO, sources: Sources | None) 
 
 
 def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufType], data: bytes) -> object:
-    """Return a message: in JSON its text, in Protocol Buffers its fields, in others None.
+    """Return a message: in JSON its text, in Protocol Buffers its fields, in other encodings None.
 
-    Why it is none is returned too, not raised: the reader counts it.
+    `types`: of each schema's number its message's name and types. The error of a message that cannot be decoded is
+    returned, not raised, so that the reader counts it and goes on.
     """
     if channel.encoding == JSON:
         return data.decode(errors="replace")
@@ -150,7 +153,10 @@ def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufT
 
 
 def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
-    """Return the number of a schema of Protocol Buffers with its types; nothing of another, or of one that is none."""
+    """Return {number of a schema: its types} of a schema record; {} of another encoding, or of one that is damaged.
+
+    The record has its number, then name and encoding, each behind its length, then LENGTH and the description of types.
+    """
     name, at = _read_sized_text(content, NUMBER.size)
     encoding, at = _read_sized_text(content, at)
     if encoding != PROTOBUF:
@@ -170,7 +176,7 @@ def _find_channels(file: BinaryIO) -> list[McapChannel]:
         file.seek(summary)
         if found := _list_channels(_read_records(file)):
             return found
-    # Without it channels stand where they are first used.
+    # Without a summary channels stand where they are first used: those behind the first message are not looked for.
     file.seek(len(MAGIC))
     return _list_channels(takewhile(lambda record: record[0] != MESSAGE, _read_records(file)))
 
@@ -181,7 +187,7 @@ def _list_channels(records: Iterable[tuple[int, bytes]]) -> list[McapChannel]:
     for kind, content in records:
         if kind == SCHEMA:
             types |= _read_protobuf_schemas(content)
-        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []
+        channels += [_read_channel(content, types)[1]] if kind == CHANNEL else []  # [0] is its number
     return channels
 
 
@@ -214,7 +220,11 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 
 def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
-    """Return the number of a channel, and its topic, encoding and schema, of which the types are known."""
+    """Return the number of a channel, and its topic, encoding and schema, from the content of its record.
+
+    `types`: types by number of a schema, as far as they are known; without them Protocol Buffers are BARE, unreadable.
+    The record begins with two numbers, of channel and schema, before its topic.
+    """
     topic, at = _read_sized_text(content, 2 * NUMBER.size)
     encoding, _ = _read_sized_text(content, at)
     (schema,) = NUMBER.unpack_from(content, NUMBER.size)
@@ -223,7 +233,7 @@ def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[in
 
 
 def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:
-    """Return the text at a place, where its length stands before it, and the place where it ends."""
+    """Return the text whose length stands at byte `at`, just before it, and the byte behind its end."""
     (size,) = LENGTH.unpack_from(content, at)
     begin = at + LENGTH.size
     return content[begin : begin + size].decode(), begin + size

@@ -87,8 +87,9 @@ class ProtobufSchema:
 
     @staticmethod
     def of(data: bytes) -> "ProtobufSchema":
-        """Read a FileDescriptorSet, by the numbers of descriptor.proto; raise ValueError at what is none."""
+        """Return the schema of a FileDescriptorSet (files of types, encoded); raise ValueError at what is none."""
         schema = ProtobufSchema({}, {})
+        # Numbers of fields in descriptor.proto: 1 file; in it 2 package, 4 messages, 5 enumerations, 12 syntax.
         for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
@@ -123,7 +124,11 @@ class ProtobufSchema:
                 add(content, f"{name}.", implicit)
 
     def _add_enum(self, data: bytes, prefix: str, implicit: bool) -> None:
-        """Read the descriptor of an enumeration into the table of the schema; `implicit`: not used of one."""
+        """Read the descriptor of an enumeration into the table of the schema.
+
+        `prefix`: full name of what it stands in, with a dot; `implicit`: not used here (that of messages needs it).
+        Numbers of fields: 1 its name, 2 its values; in a value 1 its name, 2 its number, 0 where absent.
+        """
         values = [
             {number: value for number, _, value in read_fields(content)} for content in _list_values_of_field(data, 2)
         ]
@@ -161,7 +166,10 @@ class ProtobufSchema:
         return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
 
     def _read_value(self, field: FieldDescriptor, value: Any, depth: int) -> Any:
-        """Return a value of a field as JSON has it."""
+        """Return a value of a field as JSON has it: a message as an object, an enumeration's by name, bytes as None.
+
+        `depth`: how many messages this one is within; `field.of`: full name of the message's or enumeration's type.
+        """
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
         if field.kind == ENUM:
@@ -171,7 +179,10 @@ class ProtobufSchema:
         return None if field.kind == BYTES else SCALARS[field.kind].read(value)
 
     def _choose_default(self, field: FieldDescriptor) -> Any:
-        """Return the value of a field that a message leaves out: 0, false, "", a name of an enumeration, or None."""
+        """Return the value of a field that a message leaves out: 0, false, "", a name of an enumeration, or None.
+
+        In the table of kinds 1 is double, 2 float, 8 bool; all others are whole numbers.
+        """
         if field.kind == ENUM:
             return self.enums.get(field.of, {}).get(0, 0)
         if field.kind in (TEXT, BYTES):
@@ -203,7 +214,10 @@ def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
 
 
 def _read_varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return the whole number at a place, seven bits in each byte, and the place where it ends."""
+    """Return the whole number at a place, and the place where it ends: seven bits a byte, the lowest first.
+
+    The highest bit of a byte says that another follows; a number has ten bytes at most, of which 64 bits count.
+    """
     number = shift = 0
     while at < len(data) and shift < 70:
         byte = data[at]
@@ -243,7 +257,10 @@ def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
 
 
 def _find_wire_type(field: FieldDescriptor) -> int:
-    """Return the wire type that stands before a field's value; raise ValueError at a type that is not read."""
+    """Return the wire type, which says how a field's value is laid out; raise ValueError at a type that is not read.
+
+    SIZED: its length stands before it; VARINT: a whole number of as many bytes as it needs.
+    """
     if field.kind in (TEXT, BYTES, MESSAGE):
         return SIZED
     if field.kind == ENUM:

@@ -102,7 +102,7 @@ def read_bag(
 def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
     """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
 
-    `counts`: messages of the bag by topic.
+    `counts`: messages of the bag by topic. Topics of sources with a wildcard, + or #, are never said to be missing.
     """
     others = {topic: count for topic, count in counts.items() if not sources.of(topic)}
     if others:
@@ -244,7 +244,7 @@ def _append_messages(
 
 
 def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, str]]:
-    """Yield dotted path and basic type of the fields of a message type; lists and what is in them are left out.
+    """Yield dotted path and basic type of the fields of a message type; a list has the type "list", its items none.
 
     A type that the bag does not define has no fields.
     """
@@ -283,7 +283,10 @@ def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) 
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
-    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list."""
+    """Return whether a path is a field, a message with fields (such as a stamp), or something in a list.
+
+    `fields`: type of each field by its path; that of a list is "list", and what is in it is not looked up.
+    """
     lists = [name for name, kind in fields.items() if kind == "list"]
     return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
         path.startswith(f"{name}.") for name in lists
@@ -307,7 +310,7 @@ def _format_topic_counts(counts: dict[str, int]) -> str:
 
 
 def is_mcap_cut_off(path: Path) -> bool:
-    """Return whether a file begins as MCAP and does not end as MCAP does: it was cut off."""
+    """Return whether a file begins as MCAP and does not end as MCAP does, with MAGIC too: it was cut off."""
     if not path.is_file() or path.stat().st_size < 2 * len(MAGIC):
         return False
     with path.open("rb") as file:
@@ -317,7 +320,10 @@ def is_mcap_cut_off(path: Path) -> bool:
 
 
 def find_end_of_whole_records(path: Path) -> int:
-    """Return the number of bytes of an MCAP file up to the end of its last whole record of data."""
+    """Return the number of bytes of an MCAP file up to the end of its last whole record of data.
+
+    MAGIC is what the file begins with; a record of kind DATA_END or FOOTER follows the data.
+    """
     size, end = path.stat().st_size, len(MAGIC)
     # A record: a byte for its kind, eight for the length of its content, and this.
     head = struct.Struct("<BQ")
@@ -333,7 +339,10 @@ def find_end_of_whole_records(path: Path) -> int:
 
 @contextmanager
 def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it."""
+    """Yield a temporary copy of the whole records of an MCAP file, with an end, and the bytes of data in it.
+
+    ENDING is what every whole file ends with, which a file that was cut off lacks; BLOCK bytes are copied at a time.
+    """
     end = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name

@@ -78,14 +78,17 @@ def write_forecast(record: Record, forecasts: ByFilter, path: str | Path, predic
 
 
 def _append_rows(above: np.ndarray, below: np.ndarray | None, rows: int) -> np.ndarray:
-    """Return a column with `rows` more values: those `below`, or where it has none NaN, or false."""
+    """Return a column with `rows` more values: those `below`, or where these are None NaN (of floats) or false."""
     if below is None:
         below = np.full(rows, np.nan if above.dtype.kind == "f" else False)
     return np.concatenate([above, below.astype(above.dtype)])
 
 
 def _make_output_columns(prefix: str, forecast: "heliograph.forecasting.Forecast", rows: int) -> dict[str, np.ndarray]:
-    """Return the columns of what the sensor would measure, and of its deviations where there is a claim."""
+    """Return the columns of what the sensor would measure, and of its standard deviations; none that is all NaN.
+
+    `prefix`: what their names begin with; `rows`: how many rows of data, with NaN, stand above those of the forecast.
+    """
     if forecast.outputs is None:
         return {}
     columns = {}

@@ -31,6 +31,7 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """
     database = {} if sources.dbc is None else read_can_database(sources.dbc)
     notes = list[str]()
+    # By message and signal the units, and the bits of signals that are plain whole numbers, as a counter is.
     units = {m.name: {s.name: s.unit or "" for s in m.signals} for m in database.values()}
     kinds = {m.name: f"CAN 0x{m.frame_id:x}" for m in database.values()}
     bits = {m.name: {s.name: s.length for s in m.signals if s.scale == 1 and not s.unit} for m in database.values()}
@@ -102,7 +103,7 @@ class FrameReader:
         self._note_left_out()
 
     def _note_left_out(self) -> None:
-        """Append a line on the frames that were left out, and one on those longer than the database has them."""
+        """Append a line on frames that were left out, by kind, and one on those longer than the database has them."""
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
             self._notes.append(f"{self._path}: frames left out: {counts}")
@@ -153,14 +154,17 @@ class FrameReader:
         return signals
 
     def _check_channel(self, name: str, channel: object) -> None:
-        """Raise ValueError where a message comes from two buses."""
+        """Raise ValueError where a message, by its name, comes from a second bus; `channel`: the bus of this frame."""
         seen = self._channels[name]
         seen.add(channel)
         if len(seen) > 1:
             raise fail(f"{self._path}, {name}", "one bus, which channel= of LogSources names", sorted(map(str, seen)))
 
     def _check_frames_fit_database(self) -> None:
-        """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one."""
+        """Raise ValueError if the frames of a wanted message are all too short, or no frame is of a wanted one.
+
+        By message: `self._short`: sizes of frames too short to decode; `self._decoded`: how many could be decoded.
+        """
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
             if not self._decoded[name]:

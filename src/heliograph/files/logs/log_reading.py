@@ -36,7 +36,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:
-        """Yield the messages of all logs, and collect their notes."""
+        """Yield the messages of all `logs` of the folder, and append what each notes, once it is read, to `notes`."""
         for log in logs:
             yield from log.messages
             notes.extend(log.notes)
@@ -56,7 +56,9 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Return a vehicle's log, opened by the kind of its name; only messages that are wanted are decoded.
+    """Return a vehicle's log, opened by the extension of its name; only messages that are wanted are decoded.
+
+    MDF and ULog have decoded signals; all others, and MDF where a database is given, have frames, decoded by that.
 
     Raises:
         ValueError: no such file, one that cannot be opened, frames without a database; one line.
@@ -75,7 +77,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def read_log(path: Path, table: object, sources: Sources, notes: list[str]) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
 
-    Of several logs in a folder those of one file after another; each message has to be in one of them.
+    Of several logs in a folder those of one file after another; each message asked for has to be in one of them.
 
     Args:
         path: the log, or the folder.

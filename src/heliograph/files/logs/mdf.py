@@ -40,7 +40,7 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def _name_groups(file: "MDF") -> list[str]:
-    """Return a distinct name for each channel group."""
+    """Return a distinct name for each channel group: its own, with its number where it has none or another has it."""
     names = list[str]()
     groups: Any = file.groups
     for i, group in enumerate(groups):
@@ -50,14 +50,14 @@ def _name_groups(file: "MDF") -> list[str]:
 
 
 def _list_units(file: "MDF", group: int) -> dict[str, str]:
-    """Return the units of the signals of a group, without its times."""
+    """Return the units of the signals of the group with this number, by name; its channel of times is none of them."""
     master = file.masters_db.get(group)
     channels: Any = enumerate(file.groups[group].channels)
     return {c.name: file.get_channel_unit(c.name, group=group, index=i) or "" for i, c in channels if i != master}
 
 
 def _read_group(file: "MDF", group: int, names: dict[str, str]) -> MessageSeries:
-    """Return the times and signals of a group.
+    """Return the times, in seconds, and the signals of a group; `names`: those of the signals.
 
     A sample that the file marks as invalid is None; signals of several numbers a sample are left out.
     """

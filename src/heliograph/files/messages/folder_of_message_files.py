@@ -60,7 +60,10 @@ def read_message_folder(folder: Path, sources: Sources) -> Iterator[FileMessage 
 
 
 def describe_unused_files(folder: Path, sources: Sources) -> list[str]:
-    """Return a line on the files that are no topics of sources, and one on the topics that are no files."""
+    """Return a line on the files that are no topics of sources, and one on the topics that are no files.
+
+    A topic with a wildcard, + or #, is never said to be missing.
+    """
     used = list_used_files(folder, sources)
     rest = [path.name for path in list_message_files(folder) if path not in used]
     found = {find_topic_of_file(path, sources) for path in used}

@@ -71,7 +71,8 @@ def read_parquet_names(path: Path) -> list[str]:
 def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
     """Yield the messages of a file, or why one cannot be read, in the order of the file.
 
-    Where the file is damaged or cut off the last is a `CutOffError`.
+    Where the file is damaged or cut off the last is a `CutOffError`. Files with an extension of LINES have JSON or
+    what MQTT clients print, others are CSV or Parquet.
 
     Raises:
         ValueError: the file cannot be read at all; one line.
@@ -101,14 +102,17 @@ def read_log_entry(content: object) -> tuple[str, str, Any, bool] | None:
 
 
 def find_arrival_time(logged: Mapping[str, Any]) -> Any:
-    """Return when a message with a payload was logged, as the log says it; None if it does not."""
+    """Return when a message with a payload was logged, as the log says it; None if it does not.
+
+    ARRIVALS are fields that always mean that; CLOCKS, such as "time", do where they are dates or seconds since 1970.
+    """
     arrivals = [logged[name] for name in ARRIVALS if logged.get(name) is not None]
     arrivals += [logged[name] for name in CLOCKS if _is_moment(logged.get(name))]
     return arrivals[0] if arrivals else None
 
 
 def _is_moment(value: object) -> bool:
-    """Return whether a value is a date with a zone, or seconds since 1970 of our centuries."""
+    """Return whether a value is a date with a zone, or seconds since 1970 from 2001 to 2286 (YEARS), also as a text."""
     number = parse_number(value) if isinstance(value, str) else value
     if isinstance(number, str):
         try:
@@ -123,6 +127,7 @@ def make_message_of_row(where: str, row: Mapping[str, Any]) -> FileMessage:
     """Return the message of a row of a table.
 
     Without a topic it is the row itself; with one it is what the column `payload` has, or the row if there is none.
+    Beside a payload columns such as `time` say when it was logged; without one they are fields of the message.
     """
     arrival = find_arrival_time(row) if PAYLOAD in row else row.get("arrival")
     if TOPIC not in row:
@@ -161,7 +166,10 @@ def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | I
 
 
 def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
-    """Return the message of a line, those of a list of them, or why it cannot be read."""
+    """Return the message of a line, those of a list of them, or why it cannot be read.
+
+    A line of JSON comes first; one that is none may be a topic and a payload, as MQTT clients print them.
+    """
     line = line.strip()
     if not is_valid_text(line):
         return [fail(where, "a text in UTF-8", show_value(line))]
@@ -173,9 +181,9 @@ def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
 
 
 def _make_message_of_json(where: str, content: object, doubled: str | None) -> FileMessage | InputError:
-    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file.
+    """Return the message of decoded JSON: of a log that names its topic, or of the topic of its file (topic None).
 
-    An error in place of one that has a field twice.
+    `doubled`: name of a field that it has twice, in place of which an error is returned; None if there is none.
     """
     if doubled is not None:
         return fail_of_doubled(where, doubled)

@@ -138,7 +138,10 @@ def _read_bags(path: Path, sources: Sources, progress: Progress | None, strict: 
 
 
 def is_of_messages(path: Path | StoreTable, sources: object) -> bool:
-    """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic."""
+    """Return whether a recording has messages or events, and not rows of time: a bag, a log, a table with a topic.
+
+    A table is of messages if it has a column `topic`, or the sources name it as a topic.
+    """
     if isinstance(path, StoreTable):
         named = isinstance(sources, Mapping) and (path.topic in sources or TOPIC in path.columns)
         return named or _holds_rows_of_own_format(path)
@@ -164,7 +167,7 @@ def _yield_messages(source: Path | StoreTable, sources: Sources | None = None) -
 def _read_table_of_own_format(
     path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
 ) -> EventTable:
-    """Return the events of a table in our own form."""
+    """Return the events of a table in our own form, with the columns node, sequence, time and values."""
     own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _yield_messages(path):
         own.add(message, strict)

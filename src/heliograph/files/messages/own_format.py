@@ -58,6 +58,10 @@ class OwnMessageCollector:
     """
 
     def __init__(self, network: Network, source: object, table: bool, ignore_unknown: bool):
+        """Begin with no message; `source`: what is read, for errors; `table`: whether messages are rows of a table.
+
+        Counted are messages used and refused; `reasons`: of the first refused; `broken`: where the file was cut off.
+        """
         self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
@@ -102,7 +106,7 @@ class OwnMessageCollector:
 
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and one of the inputs that it brings."""
-        found = self._reader.read(message.where, message.content)
+        found = self._reader.read(message.where, message.content)  # readings, or why there is none, and arrivals
         if self._table is None:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
         for reading, arrival in found:
@@ -133,7 +137,11 @@ class OwnMessageReader:
     """
 
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
-        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns."""
+        """Prepare to read messages in our own form, of a network; nothing is known yet of their times and columns.
+
+        `components`: names of each node's values; `numbers`: whether times are numbers and no dates, None before any;
+        `zero` and `rounded`: what large whole times count from, and the first that a double does not hold.
+        """
         self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
@@ -221,7 +229,8 @@ class OwnMessageReader:
     def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
         """Return a time that is a number; raise ValueError where it `is_step` and not a whole number from 0.
 
-        Where the first whole number is too large for a double, as of nanoseconds, all are counted from that one.
+        Where the first whole number is too large for a double (EXACT, 2^53), as of nanoseconds, all are counted from
+        that one, `self.zero`; `self.rounded` is the first time whose difference from it a double does not hold either.
         """
         number = _parse_number(cell, name)
         if isinstance(cell, int):
@@ -264,7 +273,7 @@ def _list_cell_items(cell: Any) -> list[Any]:
 
 
 def _parse_whole_number(cell: Any, name: str) -> int:
-    """Return a count with every digit; a float is accepted if it is an exact integer."""
+    """Return a count with every digit; a float is accepted if it is an exact integer, below EXACT (2^53)."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < EXACT:
         return check_63_bits(name, int(cell))
     if not isinstance(cell, int):

@@ -61,20 +61,23 @@ class Covariance:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Return the paths of the diagonal, of the entry and its mirror image, and of the kind."""
+        """Return the paths of the numbers that `of` takes: the diagonal, entries ij, ji, ii and jj, and any kind.
+
+        The message has the matrix, of `self.size` rows, as a list, row by row; `kind` says whether it is known.
+        """
         i, j = self.row, self.row if self.column is None else self.column
         places = [*((k, k) for k in range(self.size)), (i, j), (j, i), (i, i), (j, j)]
         entries = tuple(f"{self.path}.{self.size * row + column}" for row, column in places)
         return entries if self.kind is None else (*entries, self.kind)
 
     def of(self, *numbers: Any) -> Any:
-        """Return the entry, of numbers or of arrays; NaN where it is unknown."""
+        """Return the entry ij of a covariance, of numbers or of arrays; NaN where it is unknown."""
         # In the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
         diagonal, (entry, mirror, row_variance, column_variance) = numbers[: self.size], numbers[self.size :][:4]
         # As messages of ROS say it, nothing is known where the first entry is -1, or where all variances are 0.
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
-        # Entries ij and ji that differ are no covariance.
+        # Entries ij and ji that differ by more than rounding (SYMMETRIC, in deviations) are no covariance.
         deviations = np.sqrt(np.abs(np.asarray(row_variance) * column_variance))
         known &= np.abs(np.asarray(entry) - mirror) <= SYMMETRIC * deviations
         # The kind of the covariance, where the message has one: 0 is unknown.
@@ -136,7 +139,10 @@ class Geodetic:
     metres: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none."""
+        """Refuse fields that are no dotted paths, of which the height alone may be None, and units that are none.
+
+        `degrees` and `metres`: how many of these one unit of the message's numbers is, above 0 (TINY or more).
+        """
         instance("Geodetic, plane", self.plane, LocalPlane, "a hg.models.LocalPlane")
         for name in ("latitude", "longitude", "height"):
             path = getattr(self, name)
@@ -235,7 +241,10 @@ class PlaneCovariance:
         return [self.entry(row=row, column=column) for row in range(3) for column in range(3)]
 
     def of(self, *numbers: Any) -> Any:
-        """Return the entry, of numbers or of arrays; NaN where the covariance or the position is unknown."""
+        """Return the entry of the covariance in the plane's axes, of numbers or arrays; NaN where any is unknown.
+
+        `self._entries`: the nine entries in east, north, up of the fix, each with the paths that it is read from.
+        """
         # The numbers of the position, then those of each entry of the covariance, row by row.
         begin = len(self.position.parts)
         latitude, longitude, _ = self.position.coordinates(*numbers[:begin])

@@ -32,7 +32,7 @@ class Level:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name that a level of the message's topic gives; `where`: place of the message, for errors."""
+        """Return the name that the word at `self.index` of the topic gives, by `self.names` where that has it."""
         words = topic.split("/")
         if not -len(words) <= self.index < len(words):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
@@ -81,6 +81,7 @@ class Stamp:
     start: str | None = None
 
     def __post_init__(self) -> None:
+        """Refuse an offset, in seconds, that is no number, and a start of the clock's counting that is no date."""
         scalar("Stamp, offset", self.offset)
         if self.start is not None:
             parse_start("Stamp, start", self.start)
@@ -122,7 +123,10 @@ class Count:
         return 0 if self.bits is None else 1 << self.bits
 
     def check(self, number: int, name: str) -> int:
-        """Return the count `number` of a message; raise ValueError, which calls it `name`, if it is too large."""
+        """Return the count `number` of a message; raise ValueError, which calls it `name`, unless below the period.
+
+        The count begins at 0 again after `self.period` messages, 2^bits; 0 where it does not.
+        """
         if self.period and number >= self.period:
             got = f"{number}: of another modulus than bits={self.bits}"
             raise RefusedError("counter", fail(name, f"a count below {self.period}", got))
@@ -187,7 +191,7 @@ class Source:
 
     @property
     def fields(self) -> list[str]:
-        """Return the dotted paths of all fields that a message needs."""
+        """Return the dotted paths of all fields that a message needs: of values, names, time, count, and conditions."""
         values = [part for path in self.paths for part in ((path,) if isinstance(path, str) else path.parts)]
         given = (self.node, self.plant, self.time, self.sequence)
         named = [part.path for part in given if isinstance(part, Field | Stamp | Count)]
@@ -195,6 +199,8 @@ class Source:
 
     def check_valid(self, message: object, where: str) -> None:
         """Raise ValueError unless all flags of a message say that it can be trusted.
+
+        `self.valid`: by the path of a flag the values of it that say so.
 
         Raises:
             ValueError: a flag that does not, that is a text where a number is expected, or is not there.
@@ -303,7 +309,7 @@ def json_field(
 
 
 def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[Stamp | None, float | None]":
-    """Return the stamp of a source and the seconds of its steps, None where it has none; raise ValueError at others."""
+    """Return stamp and seconds of a step of a source, None where it has none; ValueError if options contradict."""
     if not isinstance(time_unit, str) or time_unit not in get_args(TimeUnit):
         raise fail("json_field, time_unit", f"one of {', '.join(get_args(TimeUnit))}", show_value(time_unit))
     stamp = Stamp(time) if isinstance(time, str) else time
@@ -316,7 +322,7 @@ def _read_time_options(time: "Time", time_unit: "Unit", step: "Step") -> "tuple[
 
 
 def read_paths(value: object) -> tuple[str | Computed, ...]:
-    """Return one path or several, checked."""
+    """Return one path (or what is computed from several, as a yaw) or a sequence of them as a tuple, checked."""
     items = [value] if isinstance(value, str | Computed) else value
     if not isinstance(items, Sequence) or not all(isinstance(path, str | Computed) for path in items):
         expected = "a dotted path, hg.files.Yaw, Covariance or east of a Geodetic, or a list of these"
@@ -358,16 +364,16 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
 
 
 def _read_valid_flags(valid: object) -> Allowed:
-    """Return the values of each flag by which a message says that it can be trusted."""
+    """Return by path of each flag the values that say that a message can be trusted; true or 1 of a path alone."""
     if isinstance(valid, str):
         return {valid: (True, 1)}
     if not isinstance(valid, Mapping | None):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
-    return _split_conditions(valid)[0]
+    return _split_conditions(valid)[0]  # those on fields of the message
 
 
 def read_texts(name: str, value: object) -> tuple[str, ...]:
-    """Return one text or several, checked."""
+    """Return one text or a sequence of them as a tuple, checked; `name`: the option, for errors."""
     items = [value] if isinstance(value, str) else value
     if not isinstance(items, Sequence) or not all(isinstance(text, str) for text in items):
         raise fail(f"json_field, {name}", "a text, or a list of texts", show_value(value))

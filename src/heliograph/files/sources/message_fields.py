@@ -71,7 +71,7 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
     doubled: list[tuple[dict[str, Any], str]] = []
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Return the fields of an object, and note the object if it has one twice."""
+        """Return the fields of an object; if it has one twice, append both to `doubled`, the objects that have."""
         fields = dict(pairs)
         if len(fields) < len(pairs):
             names = [name for name, _ in pairs]
@@ -166,7 +166,7 @@ def _make_attribute_getter(path: str) -> "attrgetter[Any]":
 def convert_number(value: Any, name: str, quoted: bool = False) -> float:
     """Return a value as a double; NaN for null, for words of that meaning, and for what is not finite.
 
-    A text of a number is one only where it may be `quoted`.
+    A text of a number is one only where it may be `quoted`. NO_VALUE matches words as "null"; `name`: for errors.
     """
     if value is None or value == "" or (isinstance(value, str) and NO_VALUE.fullmatch(value.strip())):
         return np.nan
@@ -230,6 +230,8 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
 def _read_stamp(value: Any, name: str) -> int | None:
     """Return the nanoseconds since 1970 of a stamp of two whole numbers, a dictionary or an object; None of others.
 
+    STAMPS are the pairs of names that seconds and nanoseconds have in ROS 1 and 2 and in Protocol Buffers.
+
     Raises:
         ValueError: a stamp of zero, which nobody has set; one line that begins with `name`.
     """
@@ -244,7 +246,10 @@ def _read_stamp(value: Any, name: str) -> int | None:
 
 
 def _convert_number_to_nanoseconds(value: Any, unit: Literal["s", "ms", "us", "ns"], name: str) -> int:
-    """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it."""
+    """Return the nanoseconds since 1970 of a finite number in a unit; raise ValueError where 64 bits do not hold it.
+
+    UNITS: nanoseconds of each unit. The error names a unit, if any, in which the number would be a time.
+    """
     # The decimal that was meant: a double of seconds times 10^9 is off by up to 128 ns.
     is_whole = float(value).is_integer()
     stamp = int(value) * UNITS[unit] if is_whole else round(Decimal(repr(float(value))) * UNITS[unit])

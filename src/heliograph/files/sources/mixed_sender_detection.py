@@ -17,6 +17,11 @@ class SenderCounter:
     """Counts the values of fields that are named as a sender's name is, in messages read as one node of one plant."""
 
     def __init__(self) -> None:
+        """Begin with no message.
+
+        Counts are of each value by (topic, plant, node, field); `_names`: by field whether it names a sender; `_noted`:
+        number of messages; `_said`: what was warned of.
+        """
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
         self._names: dict[str, bool] = {}
         self._noted, self._said = 0, set[tuple[str, str]]()
@@ -24,7 +29,8 @@ class SenderCounter:
     def note_fields(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Count the fields of a message that was read as one of a node of a plant.
 
-        Fields that are `asked` for by a source tell senders apart already, or are values.
+        Only fields whose names may name a sender count: several values tell that senders are mixed, but more than MANY
+        name messages. Fields `asked` for by a source tell senders apart already, or are values.
         """
         self._noted += 1
         for name, value in message.items() if isinstance(message, Mapping) else ():
@@ -58,7 +64,10 @@ class SenderCounter:
         return lines
 
     def _is_sender_name(self, field: str) -> bool:
-        """Return whether a word of a field's name, as of `entity_id` or `devEui`, says that it names a sender."""
+        """Return whether a word of a field's name, as of `entity_id` or `devEui`, says that it names a sender.
+
+        WORDS matches such words; `self._names` keeps the answers.
+        """
         if field not in self._names:
             words = re.split(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])", field)
             self._names[field] = any(map(WORDS.fullmatch, words))

@@ -111,7 +111,7 @@ class Sources:
 
     @property
     def periods(self) -> dict[str, int]:
-        """Return after how many messages the count of a node begins at 0 again, of nodes whose count does."""
+        """Return {node: after how many messages its count begins at 0 again}, of nodes whose count does."""
         mapped = [single for several in self._table.values() for single in several]
         counts = [(node, single.source.sequence) for single in mapped for node in single.places]
         return {node: count.period for node, count in counts if count is not None and count.period}
@@ -140,7 +140,7 @@ class Sources:
         return self._fields_of_topic[topic]
 
     def of(self, topic: str) -> list[MappedSource]:
-        """Return the sources of a topic, each with the places of its values in the node's measurement."""
+        """Return the sources whose pattern, a topic or one with wildcards, a topic matches, with places of values."""
         if topic not in self._sources_of_topic:
             matching = [items for pattern, items in self._table.items() if match_topic(topic, pattern)]
             self._sources_of_topic[topic] = [source for items in matching for source in items]
@@ -239,7 +239,7 @@ class Sources:
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
     def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
-        """Return whether a condition leaves a message out, or its device said that it is offline; count such ones."""
+        """Return whether a field's value that is not let in, or an offline device, leaves a message out; count it."""
         for field, allowed in source.where.items():
             if field_at(message, field, where) not in allowed:
                 self.excluded[topic] += 1
@@ -277,7 +277,7 @@ class Sources:
         return Reading(plant, node, sequence, time, np.full(len(self.names[node]), np.nan), period)
 
     def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
-        """Return a message's count, None if the source has none, and whether it is absent, which means 0."""
+        """Return a message's running count, None if the source has none, and whether its field is absent (count 0)."""
         if source.sequence is None:
             return None, False
         path = source.sequence.path
@@ -349,7 +349,7 @@ class Sources:
         raise fail(f"{name}, time", expected, got)
 
     def _index_outputs(self, name: str, source: Source, node: str) -> np.ndarray:
-        """Return the numbers of a source's outputs among those of a node, in the order of its values."""
+        """Return the indices of a source's outputs among the node's, in the order of its paths; `name`: for errors."""
         known = self.names[node]
         outputs = source.outputs or known
         if len(outputs) != len(source.paths):
@@ -378,8 +378,8 @@ def _describe_rest(count: int) -> str:
 
 
 def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
-    """Return the number at a path, or what is computed of several; NaN for what did not arrive."""
-    if isinstance(path, ZeroIfAbsent):
+    """Return the number at a path, or what is computed of several; NaN if none arrived; `quoted`: it may be text."""
+    if isinstance(path, ZeroIfAbsent):  # a field that senders leave out where it is 0
         within, _, name = path.path.rpartition(".")
         whole = field_at(message, within, where)
         return 0.0 if isinstance(whole, Mapping) and name not in whole else _read_value(whole, name, where, quoted)

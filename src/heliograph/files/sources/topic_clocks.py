@@ -44,7 +44,10 @@ class TopicClocks:
         self._by_topic: dict[str, TopicClock] = {}
 
     def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
-        """Note the time of a message, in nanoseconds since 1970."""
+        """Note the time of a message, in nanoseconds since 1970: its topic's clock counts it, and whether it is a date.
+
+        A time within a YEAR of 1970 is none of a date, but of a clock that counts from its own start.
+        """
         clock = self._by_topic.get(topic)
         if clock is None:
             path, value = _find_time_field(topic, content, sources)

@@ -151,6 +151,7 @@ def _make_headers(address: StoreAddress) -> dict[str, str]:
         return kinds | ({"Authorization": f"Token {token}"} if token else {})
     if user:
         return {"Authorization": "Basic " + b64encode(f"{user}:{password}".encode()).decode()}
+    # Version 3, which is asked in SQL, takes a bearer token; versions 1 and 2 their own word for it.
     scheme = "Bearer" if address.language == "sql" else "Token"
     return {"Authorization": f"{scheme} {password}"} if password else {}
 

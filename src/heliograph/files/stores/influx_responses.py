@@ -112,7 +112,7 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
 
 
 def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
-    """Return the columns of a row with its tags.
+    """Return the columns of a row with its tags, the words of InfluxDB that name its series.
 
     Raises:
         ValueError: a tag of a column's name, with another value: one of the two would be lost.

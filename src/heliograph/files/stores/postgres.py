@@ -88,7 +88,10 @@ def check_postgres(address: StoreAddress) -> None:
 
 
 def _convert_cells(column: np.ndarray) -> list[Any]:
-    """Return the cells of a column as the server reads them: dates to the microsecond, what is no number as NULL."""
+    """Return the cells of a column as the server reads them: dates to the microsecond, what is no number as NULL.
+
+    A value that differs from itself is NaN.
+    """
     if column.dtype.kind == "M":
         moments = np.datetime_as_string(column.astype("datetime64[us]")).tolist()
         return [f"{moment}Z" for moment in moments]
@@ -96,7 +99,7 @@ def _convert_cells(column: np.ndarray) -> list[Any]:
 
 
 def _explain_error(address: StoreAddress, error: Exception) -> InputError:
-    """Return an error of one line: the first that the server said."""
+    """Return an error of one line: the first that the server said, and whether it is away or refuses what it got."""
     said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
     away = isinstance(error, psycopg.OperationalError)
     return fail(str(address), "a server that answers" if away else "what the server accepts", said)

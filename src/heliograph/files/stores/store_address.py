@@ -37,6 +37,7 @@ class StoreAddress:
     organisation: str = ""
 
     def __str__(self) -> str:
+        """Return the address for notes and errors, without user and password."""
         parts = urlsplit(self.url)
         host = f"{parts.hostname or ''}{'' if parts.port is None else f':{parts.port}'}"
         return f"{self.kind}://{host}/{self.database}{f'?table={self.table}' if self.table else ''}"
@@ -52,7 +53,10 @@ class StoreAddress:
 
     @property
     def user_and_password(self) -> tuple[str, str]:
-        """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none."""
+        """Return user and password, or token, of InfluxDB: those of the environment, else of the URL; "" for none.
+
+        USER and PASSWORD are the names of the environment's variables.
+        """
         parts = urlsplit(self.url)
         user = os.environ.get(USER) or unquote(parts.username or "")
         return user, os.environ.get(PASSWORD) or unquote(parts.password or "")

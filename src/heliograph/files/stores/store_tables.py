@@ -36,7 +36,7 @@ class StoreTable:
         return str(self.address)
 
     def rows(self, only: Mapping[str, str] | None) -> TableRows:
-        """Return numbers and dates, of the columns among `only`.
+        """Return the table's rows, of numbers and dates, numbered from 1; of the columns among `only`, None for all.
 
         Raises:
             ValueError: a column of text; one line.

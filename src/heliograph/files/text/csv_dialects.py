@@ -56,7 +56,10 @@ def find_separator(header: Sequence[str]) -> str | None:
 
 
 def guess_names_in_header(line: str) -> set[str]:
-    """Return the names that the first line of a table may have, whatever separates them."""
+    """Return the names that the first line of a table may have, whatever separates them.
+
+    COMMENTS are marks of a comment, # and %; such a line may have blanks between names.
+    """
     separators = r"[,;\t|\s]" if line.startswith(COMMENTS) else r"[,;\t|]"
     return {name.strip().strip('"').strip() for name in re.split(separators, line.lstrip("".join(COMMENTS) + " "))} - {
         ""
@@ -95,7 +98,10 @@ def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
 
 
 def _suggest_separator(path: Path, mark: str) -> str:
-    """Return the call that rewrites a table with another separator, from the first lines of the file."""
+    """Return the call that rewrites a table whose separator is `mark`, from the file's first SEEN characters.
+
+    Commas between digits are decimal commas there.
+    """
     with open_text(path) as file:
         start = file.read(SEEN)
     if start.lstrip().startswith(COMMENTS):

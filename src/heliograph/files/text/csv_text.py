@@ -50,6 +50,7 @@ class CsvReader:
     """
 
     def __init__(self, source: str, path: Path | None, marked: bool):
+        """Begin with no line and no header; `marked`: whether a name or a cell may begin with #, and is no comment."""
         self.source, self.path, self._marked = source, path, marked
         self.header: list[str] = []
         self.number = 0
@@ -61,7 +62,7 @@ class CsvReader:
         return bool(self._open_lines)
 
     def add(self, line: str) -> list[CsvRow | InputError]:
-        """Return the rows that a line completes, or why one cannot be read.
+        """Return the rows that a line completes, or why one cannot be read; [] within a quoted cell of several lines.
 
         Raises:
             ValueError: a header that names no columns, or one of them twice; one line.
@@ -121,7 +122,10 @@ class CsvReader:
         return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
 
     def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
-        """Return why cells are no row of this table; None if they are."""
+        """Return why cells are no row of this table; None if they are.
+
+        `self._marked`: whether a row may begin with #; else such a line is a comment.
+        """
         line = ",".join(cells)
         if not is_valid_text(line):
             return fail(where, "a text in UTF-8 or UTF-16", f"{show_value(line)}{suggest_recoding(self.path, line)}")

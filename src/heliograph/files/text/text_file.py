@@ -50,6 +50,7 @@ def guess_encoding(start: bytes) -> str:
     """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
     if start.startswith(WIDE):
         return "utf-16"
+    # Ones in place of bytes that a shorter text lacks: they are not NUL.
     low, high = (*start[:2], 1, 1)[:2]
     if 0 in (low, high) and low != high:
         return "utf-16-be" if low == 0 else "utf-16-le"
@@ -70,7 +71,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
     """
     try:
         with path.open("rb") as file, _open_unpacked(file) as unpacked:
-            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))
+            encoding = guess_encoding(unpacked.peek(len(WIDE[0])))  # by as many bytes as the mark of UTF-16 has
             errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
             with TextIOWrapper(unpacked, newline="", encoding=encoding, errors=errors) as text:
                 yield text
@@ -111,7 +112,10 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
 
 
 def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
-    """Return so many bytes, or those that are left; whether the file ends with them, and what is damaged there."""
+    """Return `size` bytes, or those that are left; whether the file ends with them; the error of damage there, or None.
+
+    DAMAGE are the errors of unpacking a file that is damaged or cut off.
+    """
     parts, length = list[bytes](), 0
     try:
         while length < size and (part := file.read1(size - length)):
@@ -129,7 +133,10 @@ def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
 
 
 def _make_decoder_to_utf8(text: "gzip.GzipFile | BufferedReader") -> Callable[[bytes, bool], bytes]:
-    """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8."""
+    """Return a function from the next bytes of a text, and whether these are the last, to bytes of UTF-8.
+
+    What is no UTF-16 is passed on as it is, without the mark of UTF-8 before it.
+    """
     encoding = guess_encoding(text.peek(len(WIDE[0])))
     if encoding != "utf-8-sig":
         wide = codecs.getincrementaldecoder(encoding)("replace")

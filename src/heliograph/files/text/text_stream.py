@@ -45,6 +45,9 @@ class TextStream:
     def feed(self, data: bytes, ended: bool = False) -> bytes:
         """Return text that is complete with these bytes; `ended`: there will be no more.
 
+        The first bytes, `self._start` until they are enough, say whether all is packed (`self._inside` reads that), in
+        UTF-16 (`self._decode`) or as it should be.
+
         Raises:
             ValueError: bytes that are those of no text.
         """
@@ -66,7 +69,10 @@ class TextStream:
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
     def _begin_decoding(self, start: bytes) -> bytes:
-        """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8."""
+        """Choose how the bytes are read, by the first of them; return them without the mark of UTF-8.
+
+        NO_TEXT: what files of other kinds begin with, and what they are; GZIP: what packed ones begin with.
+        """
         for mark, kind in NO_TEXT.items():
             if start.startswith(mark):
                 came = f"{kind}: heliograph replay sends it as messages"

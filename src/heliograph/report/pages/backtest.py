@@ -39,7 +39,10 @@ class CoverageMiss:
         return self.score.coverage[self.level].value - CLAIMED[self.level]
 
     def describe(self) -> str:
-        """Return which interval held how much, in words."""
+        """Return in words which interval held what share of what came, and what that says of the forecast.
+
+        `self.level`: index among the intervals of SHARES; `self.excess`: share held less the share that it claims.
+        """
         s, share = self.score, self.score.coverage[self.level]
         return (f"{s.part} {s.name}, {s.horizon} ahead: the interval of {SHARES[self.level]} held {share.value:.1%} "
                 f"+- {share.error:.1%}: {'too sure' if self.excess < 0 else 'too cautious'}")  # fmt: skip
@@ -86,7 +89,10 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
 
 
 def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
-    """Return the verdict on each filter by its intervals and what came, the largest share of misses first."""
+    """Return the verdict on each filter by its intervals and what came, the largest share of misses first.
+
+    An interval misses whose share held is more than FAR, 3, standard errors off the share that it claims (SHARES).
+    """
     verdicts = []
     for name in dict.fromkeys(f"{s.node}/{s.filter}" for s in found.scores):
         scores = [s for s in found.scores if f"{s.node}/{s.filter}" == name and s.compared]
@@ -172,7 +178,10 @@ def make_backtest_page(
 
 
 def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
-    """Return the result in a line: of two filters what the forecasts of each are worth, of more how many hold."""
+    """Return the result in a line: of two filters what the forecasts of each are worth, of more how many hold.
+
+    Verdicts come with the most doubtful first; the line has it last.
+    """
     if len(verdicts) > 2:
         held = sum(not v.misses for v in verdicts)
         return f"The forecasts of {held} of {len(verdicts)} filters hold"
@@ -181,6 +190,7 @@ def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
     """Return all scores, a row for each forecast and horizon, with their standard errors."""
+    # Of the RMSE, a root, the standard error is that of the mean square over twice the root.
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
          round_to(s.rmse, s.mse.error / (2 * s.rmse) if s.rmse > 0 else np.nan),

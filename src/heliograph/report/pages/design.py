@@ -93,7 +93,7 @@ def make_design_summary(results: DesignResults) -> dict[str, Json]:
 
 
 def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
-    """Return by file name the figures of the front, the powers, and the map if there is one."""
+    """Return by file name the figures of the front (least error by total power), the powers, and any map of places."""
     drawn = {"front": draw_pareto_front(results.front, {"this design": (results.design.total, results.design.error)})}
     drawn["powers"] = draw_powers(results.before, compute_mean_powers(results.design))
     if results.map is not None:
@@ -174,7 +174,7 @@ def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> P
 
 
 def _make_headline(results: DesignResults) -> str:
-    """Return the title: what the design saves, of error and of power."""
+    """Return the title: by how much the design's error and total power are less, or more, than the network's now."""
     design, before = results.design, sum(results.before.values())
     changes = []
     for what, now, then in (("error", design.error, design.present), ("power", design.total, before)):
@@ -184,7 +184,10 @@ def _make_headline(results: DesignResults) -> str:
 
 
 def _make_result_section(results: DesignResults) -> Section:
-    """Return the error, power and certificate of the design, beside those of the network as it is."""
+    """Return the error and power of the design, beside those of the network as it is, and its certificate.
+
+    The certificate is a proven bound: no design has a smaller error.
+    """
     design = results.design
     keys = [
         KeyFigure("error", f"{design.error:.4g}", f"{design.present:.4g} as the network is", BLUE),
@@ -202,7 +205,10 @@ def _make_front_section(drawings: Mapping[str, bytes]) -> Section:
 
 
 def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
-    """Return the section on the powers by transmitter, before and after, and what one more watt saves at each."""
+    """Return the section on the powers by transmitter, before and after, and what one more watt saves at each.
+
+    `slope`: by transmitter the change of the error for one unit more of its mean power, negative where that helps.
+    """
     after, slope = compute_mean_powers(results.design), results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",

@@ -65,7 +65,11 @@ class FitResults:
 
 
 def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
-    """Return figures by file name: estimates; correlations of innovations before and after; PITs."""
+    """Return figures by file name: estimates; correlations of innovations before and after the fit; PITs.
+
+    PITs, probability integral transforms of what was received, are uniform where the network is right. At most MOST
+    filters are in a figure.
+    """
     drawn = {"estimates": _draw_estimates(learned)}
     tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
     if tested:
@@ -193,7 +197,10 @@ def _summarise_gain(learned: FitResults) -> str:
 
 
 def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
-    """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter."""
+    """Return the numbers to remember: how many were learned, from how many rows, and the gain of the first filter.
+
+    A gain is how much the fit raises the log-likelihood of a row that it was not fitted to; None where there is none.
+    """
     identified = [row for row in learned.fit.rows() if row.identified]
     keys = [
         KeyFigure("numbers learned", f"{len(identified)}", f"of {len(learned.fit.rows())} free ones", BLUE),

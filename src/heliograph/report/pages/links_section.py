@@ -66,7 +66,10 @@ def make_links_blocks(health: Health, drawings: Mapping[str, bytes]) -> list[Tab
 
 
 def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
-    """Return a link's row of the table, in the order of the headers of `make_links_blocks`."""
+    """Return a link's cells in the table: name, when due, share arrived, longest gap, silences, what is stated, values.
+
+    `health.silences`: by node the rows in which it was silent past its timeout; a column only where there are any.
+    """
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
     gap = "–" if link.due is None else str(link.longest_gap)
@@ -99,7 +102,7 @@ def _list_refused(health: Health) -> list[Table]:
 
 
 def _caption_deliveries(health: Health) -> str:
-    """Return what the marks of the figure of deliveries mean: only of those that it has."""
+    """Return the caption of the figure of deliveries: what its marks mean, of those marks that it has."""
     arrived = any(link.arrived.any() for link in health.links)
     lost = any(len(link.lost_times) for link in health.links)
     if arrived and lost:

@@ -232,7 +232,7 @@ def make_template_environment() -> Environment:
 
 
 def rich(text: str) -> Markup:
-    """Escape a text, then mark up `**strong**` and backquoted code."""
+    """Return a text as HTML: escaped, then with `**strong**` and backquoted code marked up."""
     # A number stays on one line with the unit, per cent or ± that belongs to it.
     safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)

@@ -25,7 +25,10 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 
 def draw_predicted_figures(health: Health) -> dict[str, Figure]:
-    """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for."""
+    """Return {file name: figure} of predictions by node, and of residuals by filter; none unless asked for.
+
+    At most MOST of each are drawn. A row is predicted from those before it; residuals are what was not predicted.
+    """
     figures = {
         f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(_list_predicting_nodes(health)[:MOST])
     }
@@ -87,7 +90,7 @@ def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> li
 
 
 def _list_predicting_nodes(health: Health) -> list[str]:
-    """Return the names of nodes with a filter that predicts what arrives."""
+    """Return the names of nodes with a filter that predicts what arrives, and not only states."""
     return [
         node
         for node, filters in health.predicted.items()

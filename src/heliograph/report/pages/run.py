@@ -65,7 +65,7 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
-        """Write the results of each plant into a folder of its own."""
+        """Write the results of each plant of `examined` into a folder of its own, named as `folders` has it."""
         for plant, health in examined.items():
             subfolder = folder / folders[plant]
             subfolder.mkdir()
@@ -147,7 +147,11 @@ def _sort_nodes(record: Record) -> list[str]:
 
 @matplotlib.rc_context(LOOK)
 def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
-    """Draw a node's estimates with their bands, one panel a state, and its forecasts behind them."""
+    """Draw a node's estimates with their bands of BAND deviations, one panel a state, and its forecasts behind them.
+
+    `record`: the rows to draw, all of `health` or a part; only that of all has forecasts. Of more filters than there
+    are COLOURS the first are drawn.
+    """
     figure, grid = make_stacked_panels(len(record.states), 1.7, 0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
     record.plot(node, names, axes=grid, sigmas=BAND)
@@ -212,9 +216,9 @@ def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
 
 
 def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[str, bytes]:
-    """Return the drawings that together have at most `limit` bytes, those of FIRST before others.
+    """Return the drawings that together have at most `limit` bytes, those named in FIRST before others.
 
-    In a page, as text, they take 4/3 of their bytes.
+    One that does not fit is left out, and smaller ones behind it may fit. In a page, as text, all take 4/3 of that.
     """
     kept, size = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):
@@ -321,7 +325,7 @@ def _describe_span(record: Record) -> str:
 
 
 def _list_doubts(doubts: list[str]) -> list[Points | Text]:
-    """Return the doubts that matter most, and where the others are."""
+    """Return the first DOUBTS (3) of the doubts, which come by weight, and a line on where the others are."""
     if not doubts:
         return [Text(["No doubts."])]
     more = f"{_count_in_words(len(doubts) - DOUBTS, 'further doubt')} of less weight: `warnings` in `summary.json`."
@@ -342,7 +346,10 @@ def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
 
 
 def _describe_overloads(record: Record) -> list[Text | Points]:
-    """Return how often the words that filters take are overloaded, before any data."""
+    """Return how often the words (quantised measurements) that filters take will be overloaded, before any data.
+
+    A word is overloaded where what it says lies beyond the ends of its range.
+    """
     lines = [
         visible(overload.describe(node, name))
         for node, by_filter in record.overloads.items()

@@ -51,7 +51,7 @@ def run_summary(health: Health) -> dict[str, Json]:
 
 
 def _list_refused(health: Health) -> list[Json]:
-    """Return what was refused, a dictionary for each node, filter, component and reason with a count; and messages."""
+    """Return what was refused, with a count and a reason: values by node, filter and component; messages by node."""
     readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
     return readings + [
         {"node": node, "reason": reason, "count": count}
@@ -61,7 +61,10 @@ def _list_refused(health: Health) -> list[Json]:
 
 
 def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
-    """Return the numbers on one filter by name: its claim, tests of its innovations, and of what messages declare."""
+    """Return the numbers on one filter by name: its claim, tests of its innovations, and of variances in messages.
+
+    Size: mean squared innovation over its variance, 1 where the claim holds; correlation: of successive innovations.
+    """
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
         numbers |= {

@@ -61,7 +61,10 @@ def _draw_bars_of_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[fl
 
 
 def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
-    """Make the axis of factors logarithmic between these limits, with ticks at plain numbers."""
+    """Make the axis of factors logarithmic between these limits, with ticks at plain numbers.
+
+    Where the limits are less than NARROW, 4, times apart, ticks are evenly spaced: few powers would lie between.
+    """
     axes.set_xscale("log")
     axes.set_xlim(*limits)
     is_narrow = limits[1] < NARROW * limits[0]
@@ -71,7 +74,10 @@ def _scale_axis(axes: Axes, limits: tuple[float, float]) -> None:
 
 
 def _find_limits(worth: SensorWorth) -> tuple[float, float]:
-    """Return the ends of the axis of all panels: a little beyond all bars, with room for their numbers."""
+    """Return the ends of the axis of all panels: a little beyond all bars, with room for their numbers.
+
+    Bars begin at 1 and end at a factor `increase`; SPARE and ROOM are shares of their span in logarithms.
+    """
     increase = np.array([case.increase for case in worth.cases])
     known = np.append(increase[np.isfinite(increase) & (increase > 0)], 1.0)
     span = max(float(np.log(known.max() / known.min())), np.log(2.0))
