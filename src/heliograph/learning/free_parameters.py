@@ -103,7 +103,7 @@ class Parameters:
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Return the coordinates of all starts."""
+        """Return the coordinates (p,) on the unbounded line at which all free numbers start."""
         return np.concatenate(
             [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
@@ -121,7 +121,11 @@ class Parameters:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Return the names of all coordinates."""
+        """Return the names of all coordinates on the unbounded line.
+
+        A number of an interval has a coordinate for each entry, of the entry's name; those of a simplex or a
+        covariance are numbered, NAME(0), NAME(1), ...
+        """
         return tuple(
             parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
             for parameter in self.every
@@ -156,7 +160,11 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives (entries, p) of the entries, mapped to the line by `link`, by the coordinates x."""
+        """Return the derivatives (entries, p) of the entries by the coordinates x (p,), each entry taken on the line.
+
+        On the line an entry is its logarithm or logit where its domain has ends. No warnings: at an end the
+        derivative may be infinite.
+        """
         pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
             return np.stack([slope_to_line(entry.domain, value) * row for entry, value, row in pairs])

@@ -54,6 +54,7 @@ def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
     """
     if freedom < 1:
         raise fail("smaller model", "one of fewer free numbers", f"{-freedom} more" if freedom else "as many")
+    # ROUNDING: nats by which the search for the larger model may have ended too low.
     if smaller > larger + ROUNDING:
         raise fail(
             "smaller model", f"a log-likelihood of at most {larger:.6g}, as part of the larger one", f"{smaller:.6g}"

@@ -137,7 +137,11 @@ def fit_sender(
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood of all recordings at a point of the line."""
+        """Return the log-likelihood of all recordings at a point of the line.
+
+        `data`: recordings side by side, of which the first `lengths` rows count. IMPOSSIBLE: a very low number
+        in place of -inf or NaN, since a search needs one.
+        """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
@@ -172,7 +176,10 @@ def _search_from_starts(likelihood: Likelihood, points: Sequence[Float[np.ndarra
     best: _BestPoint | None = None  # of all evaluations
 
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood at a point, and keep the best point so far."""
+        """Return the log-likelihood at a point, and keep the best point so far.
+
+        `best` keeps it as not converged, to be returned if the search is stopped.
+        """
         nonlocal best
         total = likelihood(x)
         if best is None or total > best.total:
@@ -320,6 +327,10 @@ class _Profile(NamedTuple):
         """Return whether the profile at a value is above the level, and its point there, searched from one nearby.
 
         The first simplex is as large as the two values are apart.
+
+        Profile: the log-likelihood with this coordinate held at the value and maximised over the others. The
+        search stops as soon as it is above `level`. NEAR, LARGEST_SIMPLEX: accuracy on the line, and the
+        largest first simplex.
         """
         size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
         best = _climb_simplex(

@@ -49,6 +49,7 @@ class HiddenModeLosses(AbstractLossLaw):
         whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return log P(fates) - log P(ends arrive) at logits x, and its gradient; `ends`: None if none are."""
             value, gradient = whole.likelihood(x)
             if ends is None:
                 return value, gradient
@@ -101,7 +102,11 @@ class FateRuns:
     """
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
-        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has."""
+        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has.
+
+        A run: packets in a row of one kind, the fate that they share, or one START. `length`: its number of
+        packets.
+        """
         self.kind = kind
         masks = {int(fate): kind == fate for fate in np.unique(kind)}
         self.runs_by_kind = {

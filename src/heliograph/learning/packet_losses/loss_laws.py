@@ -61,6 +61,8 @@ class AbstractLossLaw(Module):
 
         Of a stretch that was chosen for its ends the last one has log P(arrived | those before) - log P(arrived | the
         first), so that the sum is the log-likelihood given both ends.
+
+        CHOSEN: the fate of a packet that arrived, and is an end of its stretch for that reason.
         """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):

@@ -32,6 +32,7 @@ def maximise_over_shares(
         value, gradient = function(x)
         return -value, -gradient
 
+    # Logits beyond END are shares of 0 and 1, as far as data tell.
     bounds = [(-END, END)] * len(starts[0])
     results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
     best = min(results, key=lambda end: float(end.fun))
@@ -83,7 +84,12 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
     def height_above_level(logit_of_share: float) -> float:
-        """Return how far the profile at this logit is above the level."""
+        """Return how far the profile at this logit is above the level.
+
+        `function`: log-likelihood of all logits. i: the logit that is held; `others`: the rest, over which it
+        is maximised; `nearby`: their values at the last height above the level, from which the next search
+        begins.
+        """
         nonlocal nearby
         best_others, profile = maximise_over_shares(
             _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
@@ -108,6 +114,7 @@ def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray
     """Return the log-likelihood as a function of the `others` alone (indices of logits), where logit i is `fixed`."""
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log-likelihood with logit i held, and its gradient by the others, `free` being their values."""
         x = np.zeros(len(free) + 1)
         x[i], x[others] = fixed, free
         value, gradient = function(x)
