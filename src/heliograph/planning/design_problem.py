@@ -89,7 +89,11 @@ class Certificate(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Sentence on what the numbers certify."""
+        """Sentence on what the numbers certify.
+
+        `bound`: no design has less; `unit`: what is made small, the error or else the power; `stationarity`:
+        how far from zero the slope at the best point is, NaN if that is not known.
+        """
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         starts = "the one start" if self.starts == 1 else f"{self.starts} starts"

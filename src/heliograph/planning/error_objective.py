@@ -90,7 +90,11 @@ class Error(Module):
         return np.asarray(matrix)
 
     def criterion(self, states: tuple[str, ...]) -> "Criterion":
-        """Return the number that is to be small for a plant with these states, as a function of covariances."""
+        """Return the number that is to be small for a plant with these states, as a function of covariances.
+
+        `matrix`: weight of the states' covariance. If the worst direction counts the error is the largest
+        eigenvalue, which is smoothed by an exponent: SHARPER has these, the sharpest last.
+        """
         # The last step alone counts, or all alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
@@ -124,7 +128,11 @@ class Criterion(NamedTuple):
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def make_tangent(self, p: Matrices) -> "Criterion":
-        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere."""
+        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere.
+
+        A linear criterion is its own tangent. Of a largest eigenvalue V is the smoothed one's derivative,
+        scaled to trace 1 in units of the weight's root: no average of eigenvalues exceeds the largest.
+        """
         if self.sharpness is None:
             return self
         weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_find_root(self.weight))

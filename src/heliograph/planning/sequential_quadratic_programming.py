@@ -73,6 +73,10 @@ class ScaledProgramme:
     """
 
     def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
+        """Prepare a descent from a start, in coordinates z = x / unit, with this smoothing of the error (`sharpness`).
+
+        `size`: the objective at the start, by which it is divided, so that it is about 1.
+        """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
@@ -91,6 +95,9 @@ class ScaledProgramme:
         """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
 
         Infinite where the point does not exist.
+
+        `unit`: of each coordinate, x = unit z. Powers are summed over the steps, so that their mean is that
+        over `steps`.
         """
         evaluation = self.evaluate_at(z)
         if evaluation is None:
@@ -141,6 +148,7 @@ class ScaledProgramme:
         if np.isinf(before) and not self.is_feasible(end):
             end = self._minimize(self._compute_squared_excess, end, [], tolerance)
             return self._minimize(self.objective, end, constraints, tolerance)
+        # The merit is the objective within the limits and infinite outside.
         return end if self.merit(end) < before else z
 
     def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:

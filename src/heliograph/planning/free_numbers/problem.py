@@ -182,6 +182,7 @@ class TracedNetwork:
     start: Network
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the other leads to the same programs, by builder, network and shapes of arrays."""
         return isinstance(other, TracedNetwork) and are_same(
             (self.build, self.start, self._list_array_shapes()), (other.build, other.start, other._list_array_shapes())
         )
@@ -253,6 +254,11 @@ class FreeNumberProblem:
     """A network that is a function of numbers, as a descent needs it; the last point is cached."""
 
     def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
+        """Read the network at the starts of its free numbers, and compile its programs.
+
+        Where a mean gain is uncertain, the scalar of Young's inequality is one more free number (`young`), with which
+        the error is bounded.
+        """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
         check_time_variation(network, error)

@@ -201,7 +201,11 @@ def make_power_task(
     """
 
     def information(powers: Powers) -> PathInformation:
-        """Return the information of all paths and its slope by the free powers, the others being fixed."""
+        """Return the information of all paths and its slope by the free powers, the others being fixed.
+
+        `fixed`: powers of all hops (time, hop), of which those of the hops `free` are replaced by `powers`
+        (time, free).
+        """
         of_all_hops = fixed.copy()
         of_all_hops[:, free] = powers
         of_paths = compute_path_information(paths, of_all_hops)
@@ -228,7 +232,7 @@ def make_power_task(
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts where none is given: what peaks and means allow, or plenty.
 
-    Plenty is so much that the noise of a hop hardly counts, ten times the largest alpha.
+    Plenty is so much that noise hardly counts: ten times the largest alpha, at which half of what arrives is noise.
     """
     largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
     plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)

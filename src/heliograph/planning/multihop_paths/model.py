@@ -104,6 +104,7 @@ def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weig
     `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
     """
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
+    # A single mode, that is always on: its recursion is X+ = phi X phi'.
     always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
     return always.adjoint(weights, plants.start is None)[:, 0]
 
@@ -246,6 +247,7 @@ def _arrange_by_place(
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     position = np.empty_like(paths.path)
+    # A hop's number in the order by paths, less that of the first hop of its path.
     position[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
     along = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
     along[:, paths.path, position] = values
@@ -253,7 +255,7 @@ def _arrange_by_place(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return p / (p + alpha) of each hop (time, hop); 1 of one without noise, whatever its power."""
+    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop); alpha in sent power."""
     total = powers + alpha
     # A hop without noise: any power does.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
