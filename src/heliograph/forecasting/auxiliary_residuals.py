@@ -91,6 +91,8 @@ class Disturbances:
         level = float(scalar("false", false, 0, 1))
         residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
         size = np.nan_to_num(np.abs(residuals))
+        # Both sides of each residual that is a number: the probabilities are shared by all these tests
+        # (Bonferroni).
         p = np.minimum(2 * np.isfinite(residuals).sum() * ndtr(-size), 1.0)
         rows = _find_peaks(size.max(axis=1), p.min(axis=1) < level)
         return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]

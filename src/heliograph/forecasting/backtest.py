@@ -349,6 +349,7 @@ def roll_forecasts(
     """
     longest = horizons[-1]
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
+    # Of each row the inputs of the rows after it, (rows, longest, inputs).
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
     arguments = outlook, z, u, windows, np.asarray(horizons) - 1
     rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
@@ -372,14 +373,17 @@ def _forecast_from_each_row(
     filter, length = outlook.filter, windows.shape[1]
 
     def select(moments: Moments | None) -> Moments | None:
-        """Return the moments at `places` of all rows ahead, with variances in the place of covariances."""
+        """Return the moments at `places`, the horizons among all rows ahead, with variances in place of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         return Moments(moments.weights[places], moments.means[places], variances[places])
 
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Return the filter's state after row k, and the moments that it forecasts from there."""
+        """Return the filter's state after row k, and the moments that it forecasts from there.
+
+        `filter`: that of `outlook`, which predicts; `window`: inputs of the `length` rows ahead.
+        """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         steps_ahead = k + 1 + jnp.arange(length)

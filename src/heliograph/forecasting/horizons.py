@@ -234,6 +234,9 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
     """Return the time of each horizon on the clock of the data ([plants,] horizons): numbers or dates.
 
     `distances`: how far ahead each is, in steps or if `continuous` in the unit of dt.
+
+    `spacing`: length of a step, of dates in seconds, NaN where none is usual; `months`: how many whole months a
+    step has, 0 if it is none.
     """
     spacing = 1.0 if continuous else origin.spacing
     end = np.asarray(origin.time)[..., None]

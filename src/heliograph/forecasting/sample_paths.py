@@ -239,7 +239,11 @@ def _draw_paths_from_states(
         return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path."""
+        """Return the states (rows, n) and outputs (rows, m) of one path.
+
+        `start`: state and mode; `u`: inputs of the rows ahead; `step`: number of the first of them; `move`: a
+        step of a path.
+        """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: move(before, row, key), start, rows)[1]
         return path

@@ -30,7 +30,10 @@ def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarra
 
 
 def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return the log density of what came (rows,), in nats: the larger the better."""
+    """Return the log density of what came (rows,), in nats: the larger the better.
+
+    LOG_TURN: log(2 pi). The largest term is taken out of the sum, lest every exponential is 0.
+    """
     terms = (
         np.log(law.weights)
         - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2

@@ -241,6 +241,8 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
 
     It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
+
+    `factor`: of the second moment of each pair of entries of (G, n), the product of the two entries' factors.
     """
     q, (_, factor) = units.received, _list_channel_factors(units)
 
@@ -271,7 +273,10 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
 
 
 def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
-    """Return the combinations of a filter's atoms with state and measurements in other units."""
+    """Return the combinations of a filter's atoms with state and measurements in other units.
+
+    A combination: one value of each discrete gain, with its probability `weight` and the channel that it makes.
+    """
     values = stack_over_time(components)
     q = units.received
     scaled = AtomCombinations(
@@ -286,7 +291,11 @@ def _rescale_combinations(components: AtomCombinations | OverTime, units: Units)
 
 
 def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> UnconditionalMean | None:
-    """Return the mean before data with state and measurements in other units."""
+    """Return the mean before data with state and measurements in other units.
+
+    With x in units S and z in units Q: the start is S E[x_0], the transition S A S^-1, the drift S b, and the
+    matrix with which the mean is received Q M S^-1.
+    """
     if centre is None:
         return None
     s = units.states

@@ -169,6 +169,7 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
     assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
+    # Silence tells something where a sender decides when to send.
     if np.all(missing) and filter.silence_tells:
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood of silence, got {likelihood:g}"
     elif np.all(missing):

@@ -171,6 +171,7 @@ def _count_possible_rows(network: Network, node: str, name: str, z: dict[str, np
     else:
         runs = [(network.nodes[n].filters[fusion.filter], z[n]) for n in network.nodes_with(fusion.filter)]
     impossible = [np.isneginf(filter.run(rows, u).log_likelihoods) for filter, rows in runs]
+    # The index of the first impossible row; a True behind all rows stands for none.
     return int(np.argmax(np.append(np.any(impossible, axis=0), True)))
 
 
