@@ -93,6 +93,7 @@ class _LaggedSmoother:
     """
 
     def __init__(self, timeline: Timeline, lag: float):
+        """Keep the timeline, and the lag after which each of its moments is smoothed into `smoothed`."""
         self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
         self._timeline, self._lag = timeline, lag
         self._waiting: list[float] = []  # a heap of moments of which the lag has not passed

@@ -124,6 +124,7 @@ class PlantState:
         leap, newest = found
         if agreed or leap.is_taken_back_by(clock, time, newest):
             self.undo_leap(leap, longest_gap, names)
+        # A first message of its own clock that goes on from before it: the next may take it back.
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
 
@@ -210,7 +211,10 @@ class PlantState:
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
-        """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
+        """Return the events of leaps that were taken back since the last call, and the slots of their rows.
+
+        Withdrawn events are those that a wrong clock had made, known by a later message.
+        """
         leaps, self.aside = self.aside, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
         return events, [row.slot for leap in leaps for row in leap.gone]
@@ -293,7 +297,7 @@ class PlantState:
         return slots
 
     def link_counts(self, node: str) -> LinkCounts:
-        """Return the counts of a node."""
+        """Return the counts of a node's messages; new ones if it has none yet."""
         link = self.links.get(node)
         if link is None:
             link = self.links[node] = LinkCounts()
@@ -309,6 +313,9 @@ class PlantState:
         """Make rows before the watermark final; return them and the slots that are no longer needed.
 
         `longest_gap`: longest gap that is no leap; of the rows before a leap the newest is kept.
+
+        Watermark: time up to which rows become final. Base: the newest final row, from which the others are
+        stepped. `forced`: rows that became final early, for lack of room.
         """
         self.changes = []
         base, forced = self.rows.find_base(watermark)
@@ -337,7 +344,11 @@ class PlantState:
 
     @property
     def slots(self) -> list[int]:
-        """Return all slots of the plant."""
+        """Return all slots of the plant.
+
+        A slot is the number of a row in the table. `kept`: the row from before a leap; `gone`: rows removed as
+        a leap was taken back.
+        """
         kept = [] if self.kept is None else [self.kept.row]
         gone = [row for leap in self.aside for row in leap.gone]
         return [row.slot for row in (*self.rows.held, *kept, *gone)]

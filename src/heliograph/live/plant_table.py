@@ -50,6 +50,7 @@ class SlotTable:
     def take_slot(self) -> int:
         """Take a free slot."""
         if not self._free:
+            # Double the table; the new slots are free, and the lowest is taken first.
             count = len(self.table)
             self.table = np.concatenate([self.table, np.zeros_like(self.table)])
             self._free = list(range(2 * count - 1, count - 1, -1))
@@ -114,7 +115,11 @@ class SlotTable:
         return self.step_rows(np.concatenate(parts, axis=1))
 
     def inputs_between(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
-        """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
+        """Return the inputs that led from the row in one slot to that in another, and the number of the step there.
+
+        In continuous time the inputs that held after `before` lead on, with dt the time between both rows; else
+        those that `after` holds.
+        """
         dt, table = self.program.dt, self.table
         u = table[after if dt is None else before, self.held]
         if dt is not None:
@@ -128,6 +133,7 @@ class SlotTable:
         nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+            """Return states (row, state) after step number k without measurements, under the inputs that hold."""
             rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))
             return self._step_parts(states, rest)[:, : self.step_rows.state.size].copy()
 

@@ -96,7 +96,10 @@ class Stream:
 
     @property
     def doubt(self) -> str:
-        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else ""."""
+        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else "".
+
+        BEYOND: 10 in a row, each of a size that a right filter sees with probability RARE.
+        """
         if self._beyond < BEYOND:
             return ""
         return (
@@ -177,7 +180,10 @@ class Stream:
 
     @property
     def origin(self) -> Origin:
-        """Return the state after the last step, from which `hg.forecast` predicts."""
+        """Return the state after the last step, from which `hg.forecast` predicts.
+
+        `spacing`: time from one step to the next, NaN where it is an input (dt). Time counts steps from 0.
+        """
         state = self._compiled.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
         return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
@@ -277,6 +283,7 @@ class Stream:
             "repeats": self._repeats,
             "last": self._last,
             "beyond": self._beyond,
+            # JSON has no NaN: an input that is not known is None.
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
             "of": self._compiled.identity,
         }

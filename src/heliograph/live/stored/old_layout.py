@@ -49,7 +49,10 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
 
 
 def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
-    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order."""
+    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order.
+
+    Until then a covariance P stood where its factors stand now, L below the diagonal (LOWER) and D (VARIANCES).
+    """
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
         place = _flatten_path(path)
@@ -110,10 +113,12 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
 
 
 def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFlag | None:
-    """Add the columns of a filter's parts to those taken, up to its first flag, which is returned; None without one.
+    """Add the columns of a filter's parts to `taken`, up to the first flag; return that flag, or None without one.
 
-    A flag's columns begin before the end of the part before it, or, of a flag that comes first, are taken already.
-    What comes after the flag is taken too where it lies behind the part before it.
+    A flag is a boolean part. Old versions wrote its value, 0 or 1, where the number of its first column belongs, so
+    that its columns are not known ("lost"). It is found by that number: no part begins before the end of the part
+    before it, or, as the first, at a column that is taken. Parts after the flag that begin behind the part before
+    it have true columns, and are taken as well.
 
     Args:
         parts: of one filter, in their order.
@@ -122,7 +127,7 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
     """
     for i, part in enumerate(parts):
         if part.columns and (part.first < end or (not end and part.first in taken)):
-            # A flag that comes first is of the memory of fusions, which stands behind all filters.
+            # A flag that comes first is of the memory of fusions, which stands behind all filters: so does its end.
             end = end or sys.maxsize
             after = parts[i + 1 :]
             for later in after:
