@@ -120,7 +120,7 @@ class Backtest:
         if not found:
             known = ", ".join(dict.fromkeys(f"{s.node}/{s.filter} {s.name}" for s in self.scores))
             raise fail("score", f"one of {known} at {list(self.horizons)}", f"{node}/{filter} {name} at {horizon}")
-        return found[-1]
+        return found[-1]  # of a state and a received number of one name the latter, which comes later
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return a table with a row for each score, and columns of means and their standard errors.
@@ -222,7 +222,7 @@ def list_single_filters(network: Network) -> set[tuple[str, str]]:
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
     """Return the measurements that a filter receives (steps, received), of a central one those of all nodes."""
     z = record.measurements.get(target.node)
-    if z is None:  # of a central filter, all nodes' numbers
+    if z is None:  # of a central filter, all nodes' numbers; one that receives nothing has no columns
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
     return z if target.outlook.filter.received else z[:, :0]
 

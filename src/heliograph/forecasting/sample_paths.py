@@ -137,6 +137,8 @@ class ModeSwitching(NamedTuple):
         """Return the mode of step k, drawn by the chain from that of the step before, or that one itself.
 
         It stays at the first of all steps unless the chain has `moved` before. `u`: inputs of the step.
+
+        `moved`: whether the filter has predicted before; if not, its modes are already those of the first step.
         """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
         rows = transition_over(plant, u, jnp.asarray(channel.transition))

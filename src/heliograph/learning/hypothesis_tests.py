@@ -79,6 +79,7 @@ def wald_test(
     if not asked or set(asked) - set(estimates):
         raise fail("values", f"numbers for some of {list(estimates)}", list(asked))
     places = [list(estimates).index(name) for name in asked]
+    # Numbers at a boundary, or not identified, have NaN as covariance.
     inner = covariance[np.ix_(places, places)]
     if not np.isfinite(inner).all():
         raise fail("values", "numbers that are identified and not at a boundary", list(asked))

@@ -257,6 +257,9 @@ def _make_row_without_interval(description: Description, x: Float[np.ndarray, " 
 def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_BestPoint", index: int) -> Row:
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
+    The profile is the log-likelihood maximised over all other coordinates; the interval ends where it has fallen to a
+    level. NORMAL: 1.96 standard errors from the middle to either end of 95 %.
+
     Args:
         row: the row without an interval.
         description: the network with its free numbers.

@@ -144,6 +144,8 @@ def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
     """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
 
     `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.
+
+    SAME: singular value that is rounding.
     """
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))

@@ -104,7 +104,10 @@ class _LaggedSmoother:
             heappush(self._waiting, moment)
 
     def smooth_until(self, arrival: float) -> None:
-        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it."""
+        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it.
+
+        `_waiting`: a heap of moments to smooth, the earliest first; `window`: the longest lag that the timeline has.
+        """
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
             moment = heappop(self._waiting)

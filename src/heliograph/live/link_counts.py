@@ -159,6 +159,9 @@ class LinkCounts:
 
         It is the nearest one to `newest`, above it for a message measured later and below it for one before; where that
         is more than GAP away the node was restarted, and its own count is returned.
+
+        `newest`: the greatest count so far, -1 before the first, of a message measured at time `at`. GAP: most messages
+        that may be lost in a row.
         """
         if not period or self.newest < 0:
             return sequence

@@ -155,7 +155,11 @@ class PlantState:
         self.now, self.leap = max(newest, now), leap
 
     def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
-        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed."""
+        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed.
+
+        By another clock it is confirmed at once, by its own if the plant has gone on for as long as it leapt
+        (`is_over`). INPUTS: no clock of its own; ARRIVAL: the clock by which arrivals are dated.
+        """
         if clock != leap.clock:
             return None
         if leap.is_over(self.now):
@@ -204,6 +208,7 @@ class PlantState:
             for node, _, _ in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
+            # `moments`: times of the node's counts before the leap.
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
     def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
@@ -270,6 +275,9 @@ class PlantState:
         """Undo the changes since the last finalisation; return the slots that are free again.
 
         Rows that had been stepped since become dirty.
+
+        `aside`: what each leap that was taken back had removed; `kept`: the row from before a leap; `dirty`: index of
+        the first row to step again; base: the first held row, which is final.
         """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
         # Newest first: what changed after each leap that was taken back, then this itself.
@@ -285,7 +293,10 @@ class PlantState:
         return slots
 
     def _undo_since(self, count: int) -> list[int]:
-        """Undo the changes after the first `count`, newest first; return the slots that are free again."""
+        """Undo the changes after the first `count`, newest first; return the slots that are free again.
+
+        A change: a row, and its numbers and events before, None if there was no such row.
+        """
         slots = []
         for row, before in reversed(self.changes[count:]):
             if before is None:  # the row was new
@@ -304,7 +315,10 @@ class PlantState:
         return link
 
     def take_dirty_rows(self) -> list[HeldRow]:
-        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none."""
+        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none.
+
+        `dirty`: index of the first held row to step again, None if all are up to date. The base, index 0, never is.
+        """
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None
         return chain

@@ -101,6 +101,7 @@ class SortedRows:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
+        # Keys are sorted as the rows are, by time first.
         index = bisect_left(self.keys, key)
         exists = self.keys[index] == key
         return index, self.held[index] if exists else None
@@ -153,7 +154,10 @@ class SortedRows:
         return number, [(row_after, float(count_after - count - 1) if count < count_after else nan)]
 
     def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of a node, and the event's running count; None if none has."""
+        """Return the first of these rows with an event of a node, and the event's running count; None if none has.
+
+        An event's name is (node, running count, time measured).
+        """
         for i in indices:
             for name in self.held[i].events:
                 if name[0] == node:

@@ -195,7 +195,11 @@ class Stream:
         return np.array(found, dtype=np.int64)
 
     def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> list[str]:
-        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is."""
+        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is.
+
+        A filter either refuses stuck readings (`screened`), or a watch only tells of them. `refused`: counts by reason;
+        `_repeats`: runs of equal readings.
+        """
         if screened is not None:
             for reason, more in count_by_reason(screened.refused).items():
                 self.refused[reason] += more

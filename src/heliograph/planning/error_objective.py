@@ -116,6 +116,8 @@ class Criterion(NamedTuple):
         """Return the number at covariances p (time, n, n), smoothed where it is an eigenvalue, and dnumber/dP of each.
 
         The search takes it for the error; `exact` is the error itself.
+
+        `shares`: the weight of each step in the error.
         """
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights

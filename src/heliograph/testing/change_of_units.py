@@ -206,7 +206,10 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
+    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one.
+
+    `inputs`: factors of the inputs, by which they are divided before the function of them is called.
+    """
     factor = out[:, None] / into
     if isinstance(matrix, MatrixOfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
@@ -220,7 +223,10 @@ def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
 
 
 def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
-    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R."""
+    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R.
+
+    S and R are diagonal, of the factors of states and outputs in `units`; V: covariance of the noise.
+    """
     s, r = units.states, units.outputs
     if isinstance(sensor, LinearSensor):
         return LinearSensor(

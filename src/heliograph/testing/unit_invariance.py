@@ -211,6 +211,7 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
     for affine in maps:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
         off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
+        # DIGITS: the largest relative difference that is allowed.
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
     filters = {f: rescale_filter(filter, units) for f, filter in node.filters.items()}
     return Node(rescale_sensor(node.sensor, units), _change_units_of_channel(node.channel, units), filters)

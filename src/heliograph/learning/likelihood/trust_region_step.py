@@ -107,6 +107,8 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
     """Return (B + s D^2)^-1 r of each lane (lanes, p); 0 along directions in which the matrix is singular.
 
     `b`: B (lanes, p, p); `shift`: s (lanes,); `d`: the diagonal of D (lanes, p); `right`: r (lanes, p).
+
+    A lane is one of several searches side by side. ROUNDING: share of the largest eigenvalue below which one is 0.
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:

@@ -137,7 +137,11 @@ def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error."""
+    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error.
+
+    X_k,j: covariance after step k in mode j, weighted by the mode's probability; its right side: what the recursion
+    under the gains K makes of those before it; L: adjoint, what the error gains by each X.
+    """
     parts, gains, adjoint = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do

@@ -280,6 +280,8 @@ class FreeNumberProblem:
         """Raise ValueError where a number near an end of its range, the others at their starts, makes no network.
 
         An end itself may be one that is never reached, as a noise of variance zero.
+
+        INSIDE: how near to an end a number is put, as a share of the way to its start.
         """
         starts = {name: number.start for name, number in self.numbers.by_name.items()}
         for name, (start, low, high) in self.numbers.by_name.items():
@@ -300,6 +302,7 @@ class FreeNumberProblem:
             ValueError: an error that grows without limit, powers that do.
         """
         criterion = self.criterion if criterion is None else criterion
+        # Only the last point is kept: a search asks for its error, then for its slopes.
         key = x.tobytes(), criterion.sharpness
         if key not in self._last:
             system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))

@@ -60,7 +60,7 @@ class PathProblem(NamedTuple):
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
         """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
 
-        By one adjoint recursion, at the free powers p (time, free).
+        By one adjoint recursion, at the free powers p (time, free). j: information of a path; `path`: that of each hop.
         """
         information, slope = self.information(powers)
         p = compute_error_covariances(self.paths, information)
@@ -326,7 +326,7 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the powers of the least total that reaches a target, by descents from the starts; None where none does.
 
-    Each start is raised first until it reaches the target.
+    Each start is raised first until it reaches the target. `scale`: size of the powers, in which the search steps.
     """
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
@@ -341,7 +341,7 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
     """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None.
 
-    By bisection of the factor's logarithm.
+    By bisection of the factor's logarithm, between the ends FACTORS.
     """
 
     def reaches(factor: float) -> bool:
