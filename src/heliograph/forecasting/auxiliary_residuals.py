@@ -175,7 +175,10 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
 
 
 def _is_received_unchanged(predicted: Forecast) -> bool:
-    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged."""
+    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged.
+
+    EQUAL: the largest relative difference, that of rounding.
+    """
     sent, came = predicted.outputs, predicted.received
     return (
         sent is not None
@@ -242,6 +245,8 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
     """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
 
     `covariance`: (steps, size, size).
+
+    ROUNDING: share of the largest variance over the steps, up to which it is none.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     known = variance > ROUNDING * np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)

@@ -179,7 +179,10 @@ _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covaria
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
-    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
+    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary.
+
+    FUSED: the name under which estimates of all nodes together stand.
+    """
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None

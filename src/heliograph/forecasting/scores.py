@@ -78,6 +78,8 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
     rows at least. Var = n^-2 sum_l w_l sum_t d_t d_{t+l} with Bartlett's weights over max(h - 1, 1.3 sqrt n) lags.
 
+    BANDWIDTH: that 1.3.
+
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
     """
     came = ~np.isnan(values)

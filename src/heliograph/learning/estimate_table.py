@@ -331,7 +331,7 @@ class Solution:
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return both ends of an interval, relative to the estimate, by sums of blocks of scores that are drawn anew.
+        """Return both ends of an interval, relative to the estimate, by DRAWS sums of blocks of scores drawn anew.
 
         `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
         the sum.

@@ -69,7 +69,10 @@ class Parameter:
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Return the domain of each of its entries in the table."""
+        """Return the domain of each of its entries in the table.
+
+        Entries of a simplex are probabilities; of a covariance those on the diagonal are positive, the others real.
+        """
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
         if self.domain.kind == "covariance":

@@ -157,7 +157,11 @@ class JudgementReader:
         return rows.held[rows.find_index(candidate.row.key) - 1]
 
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
-        """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
+        """Return what a filter estimated after a row, from its columns; before all events its initial estimate.
+
+        BEFORE: in place of a node, what stands before all events. `columns`: where mean and covariance begin among the
+        outputs.
+        """
         if row.key[1] == BEFORE:  # no estimate was computed there
             return filter.estimate(filter.init())
         n, outputs = len(filter.states), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]

@@ -146,6 +146,8 @@ class SlotTable:
         """Return the rows in these slots, in order, as a smoother takes them.
 
         Copies of the last row behind them make their number a power of two, so that few lengths are compiled.
+
+        SHORTEST: the least number. A slot is the number of a row in the table.
         """
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())  # the next power of two
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]

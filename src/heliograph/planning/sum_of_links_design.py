@@ -277,6 +277,8 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
     """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
 
     By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
+
+    `fixed`: power of the links that are not free.
     """
     low, high = 0.0, needed - task.fixed
     for _ in range(HALVINGS):

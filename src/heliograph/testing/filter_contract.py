@@ -181,7 +181,10 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
 
 
 def _check_same(what: str, estimate: Estimate, expected: Estimate) -> None:
-    """Raise AssertionError unless estimates are equal to rounding."""
+    """Raise AssertionError unless estimates are equal to rounding.
+
+    ROUNDING: the relative difference that is allowed. `what`: the operation, for the error's words.
+    """
     for name in ("mean", "covariance"):
         a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))
         same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)

@@ -116,6 +116,7 @@ class FateRuns:
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
         """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
+        # Fates as whole numbers: 0 arrived, 1 lost, and UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
         return FateRuns(code[first], np.diff(np.append(first, len(code))))
@@ -123,7 +124,7 @@ class FateRuns:
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
 
-        By complex steps: the imaginary part of l(x + i h) is h dl/dx.
+        By complex steps: the imaginary part of l(x + i h) is h dl/dx, its square being nothing (h = STEP).
         """
         # Rows 0 to 3 have a step in one logit each, row 4 none.
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)

@@ -55,7 +55,8 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
     """Return share i at the maximum `top` (logits), with the interval at whose ends its profile has fallen by FALL.
 
-    `value`: the log-likelihood at the maximum.
+    `value`: the log-likelihood at the maximum. Of a share at 0 or 1 one side of the interval is open, and its fall
+    is FALL_AT_END. END: the largest logit of the search.
     """
     # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4

@@ -32,6 +32,9 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
     That is so if each part of `new` was there with its shape, or is a factor of a covariance that was there.
+
+    A part is known by its path, such as ".covariance" behind a stem; its factors are the parts LOWER (L below the
+    diagonal) and VARIANCES (D), of n (n - 1) / 2 and n numbers.
     """
     shapes, places = {path: list(shape) for path, shape in old.items()}, _trace_paths(old, new)
     for stem in _find_factored(old, places.values()):
@@ -41,7 +44,10 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
+    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states.
+
+    A covariance of which only the factors are wanted, LOWER (L below the diagonal) and VARIANCES (D), is factorised.
+    """
     results, places = dict(parts), _trace_paths(parts, new)
     for stem in _find_factored(parts, places.values()):
         results[stem + LOWER], results[stem + VARIANCES] = factorise_covariance(results.pop(stem + COVARIANCE))
@@ -171,7 +177,10 @@ def _flatten_path(path: str) -> str:
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
-    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead."""
+    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead.
+
+    LOWER and VARIANCES end the paths of its factors, L below the diagonal and D.
+    """
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]
     return [stem for stem in stems if {stem + LOWER, stem + VARIANCES} <= now - before]

@@ -196,7 +196,11 @@ class TracedNetwork:
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
     def make_system(self, x: Array) -> ModeSystem:
-        """Return the system of the best linear filter where the free numbers have the values x (numbers,)."""
+        """Return the system of the best linear filter where the free numbers have the values x (numbers,).
+
+        `young`: whether the scalar of Young's inequality is among the numbers, which is none of the network's own.
+        UNTRACEABLE: errors of JAX where a function reads a traced number.
+        """
         values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
         try:
@@ -222,7 +226,10 @@ class TracedNetwork:
 def compile_programs(
     network: TracedNetwork,
 ) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
-    """Return the compiled programs of a network's system and derivatives; equal networks share them."""
+    """Return the compiled programs of a network's system and derivatives; equal networks share them.
+
+    PROGRAMS: so many of the last ones are kept.
+    """
     return compile_on_call(network.make_system), compile_on_call(network.differentiate_by_numbers)
 
 
@@ -270,7 +277,10 @@ class FreeNumberProblem:
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
-        """Return the network at these numbers."""
+        """Return the network at these numbers.
+
+        The scalar of Young's inequality (YOUNG) is none of its numbers.
+        """
         named = self.numbers.split_by_name(x).items()
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
@@ -332,7 +342,10 @@ class FreeNumberProblem:
         )
 
     def descent_problem(self) -> DescentProblem:
-        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
+        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none.
+
+        LEAST_UNIT: the unit of numbers whose range and start are less.
+        """
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
         return DescentProblem(

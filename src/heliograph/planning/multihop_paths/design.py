@@ -357,10 +357,10 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError where the target is not above the error that remains however much is sent."""
+    """Raise ValueError where the target is not above (by REACHED) the error that remains however much is sent."""
     limits = task.problem.limits
     bounded = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
-    # The most that each may send: up to its peak, or plenty, or its whole mean power in one step.
+    # The most that each may send: up to its peak, or plenty (UNLIMITED), or its whole mean power in one step.
     most = np.minimum(limits.peak, UNLIMITED * np.maximum(task.problem.paths.alpha[:, task.free], 1.0))
     most = np.minimum(most, limits.mean * len(most))
     left = task.problem.compute_exact_error(most)

@@ -60,6 +60,8 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
 
+    It is reached when a doubling changes H by no more than a share CONVERGED.
+
     Raises:
         ValueError: covariances that grow without limit.
     """

@@ -263,6 +263,8 @@ def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance
     """Raise ValueError where two paths of a node carry correlated noise of its sensor.
 
     `rows`: combination of the outputs that each path carries; `covariance`: of the sensor's noise.
+
+    UNCORRELATED: a correlation that is rounding.
     """
     noise = rows @ covariance @ rows.T
     deviation = np.sqrt(np.diag(noise))
