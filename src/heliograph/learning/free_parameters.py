@@ -39,7 +39,10 @@ class Parameter:
 
     @property
     def entry_names(self) -> tuple[str, ...]:
-        """Return the names of its entries in the table; of a covariance those on and below the diagonal."""
+        """Return the names of its entries in the table; of a covariance those on and below the diagonal.
+
+        `start`: the value of the number from which a search begins, which has its shape.
+        """
         if self.start.ndim == 0:
             return (self.name,)
         indices = np.ndindex(self.start.shape)
@@ -57,7 +60,11 @@ class Parameter:
             return np.asarray(self._trace_entries(np.asarray(x)))
 
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
+        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line.
+
+        Entries of an interval have a coordinate each, so that theirs is a diagonal matrix; of others JAX
+        differentiates.
+        """
         if self.domain.kind == "interval":
             return np.diag(slope_from_line(self.domain, x))
         with jax.enable_x64(True):

@@ -121,7 +121,10 @@ class XlaFilterStepper:
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite."""
+        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite.
+
+        `_run`: the compiled step; `_tree`: structure of the state; `accept` puts the state after in the state's place.
+        """
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
             judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
@@ -300,7 +303,11 @@ class CompiledFilter:
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior."""
+        """Return a new stepper whose state is the prior.
+
+        By native code (`code`) where there is some for the filter, else by XLA. `_start`: the prior as state; `_static`
+        and `numbers`: the filter without its arrays, and these.
+        """
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:
             return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)

@@ -39,7 +39,10 @@ class RemarkWatch:
         plant.remarked = {place: said.times for place, said in self._read_remarks(plant.rows.held[-1]).items()}
 
     def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
-        """Return the remark of each filter on its state after a row, by node and filter."""
+        """Return the remark of each filter on its state after a row, by node and filter.
+
+        `counts` has an entry for each filter that can say anything.
+        """
         if not self.counts:
             return {}
         return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])

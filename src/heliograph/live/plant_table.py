@@ -61,7 +61,10 @@ class SlotTable:
         self._free += slots
 
     def write_prior(self, slot: int, time: float) -> None:
-        """Fill a slot with the prior, at `time`, before any measurement."""
+        """Fill a slot with the prior, at `time`, before any measurement.
+
+        A row has the filters' state, its step number (`at`), the `numbers` that came, NaN for none, and last its time.
+        """
         row = self.table[slot]
         row[:] = 0.0
         step_before_all = -1.0
@@ -109,6 +112,8 @@ class SlotTable:
         """Return (row, state and outputs) after a step of rows (state, received, inputs, step number), given in parts.
 
         The result for a single row is overwritten by the next call.
+
+        `_alone`: single rows are stepped, not those of many plants at once; `is_native`: by native code.
         """
         if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
             return self._step_single_row(*parts)

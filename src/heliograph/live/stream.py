@@ -168,6 +168,8 @@ class Stream:
         """Return the estimate after the step just done, and count the components that the filter weighed by 0.
 
         `nis`: of the step's measurement, NaN where it has none; `arrived`: how many of its numbers arrived.
+
+        `weight`: of each component, 0 where the filter's gate left it out as too far off.
         """
         estimate: JudgedEstimate = self._compiled.estimate.unflatten([*self._stepper.estimate, nis, arrived])
         if len(weight := self._stepper.weight):
@@ -215,7 +217,10 @@ class Stream:
         return [f"step {self.steps - 1}: {words}" for words in said]
 
     def _describe_remark(self) -> list[str]:
-        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none."""
+        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none.
+
+        `said.times`: how often the filter has had it to say so far; `_remarked`: how often when last asked.
+        """
         said, before = self.filter.remark(self._compiled.state.unflatten(self._stepper.state)), self._remarked
         self._remarked = said.times
         return [said.words] if said.times > before else []
@@ -268,6 +273,8 @@ class Stream:
 
     def sender(self) -> SenderStatus:
         """Return the status of a sender that decides when to send: what its silence means by now.
+
+        `_last`: step of the newest measurement that arrived, negative before the first.
 
         Raises:
             ValueError: a filter that is none of `event_filter`.

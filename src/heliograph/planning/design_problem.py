@@ -138,6 +138,8 @@ class PowerDesign(Module):
 
         Of free numbers the network that their function returns. A period is repeated for about 100 steps.
 
+        `realised`: that of free numbers, None for powers.
+
         Raises:
             ValueError: a design of independent paths, which belong to no network.
         """

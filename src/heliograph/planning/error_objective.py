@@ -123,7 +123,11 @@ class Criterion(NamedTuple):
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def compute_exact_error(self, p: Matrices) -> float:
-        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
+        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue.
+
+        It is the trace of W P, or where `sharpness` is set the largest eigenvalue of W^1/2 P W^1/2; `shares`:
+        the weight of each step.
+        """
         if self.sharpness is None:
             return self.smooth(p)[0]
         root = _find_root(self.weight)
@@ -146,7 +150,10 @@ class Criterion(NamedTuple):
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue."""
+        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue.
+
+        W: `weight` of each step; S = W^1/2 P W^1/2; q: `sharpness`, None for the trace.
+        """
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.

@@ -85,7 +85,10 @@ class ScaledProgramme:
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point z, None where it does not exist; the last one is cached."""
+        """Return the evaluation at a point z, None where it does not exist; the last one is cached.
+
+        z: the point in units of each coordinate; `sharpness`: exponent by which the error is smoothed.
+        """
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)

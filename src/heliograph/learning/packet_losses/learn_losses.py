@@ -186,8 +186,8 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for.
 
-    Of the Markov laws one looks back over one packet, the other over LONG; HIDDEN has a good and a bad mode that are not
-    seen; RUNNING follows the share of losses as it drifts.
+    Of the Markov laws one looks back over one packet, the other over LONG; HIDDEN has a good and a bad mode that are
+    not seen; RUNNING follows the share of losses as it drifts.
     """
     return {
         INDEPENDENT: IndependentLosses.fit(parts),

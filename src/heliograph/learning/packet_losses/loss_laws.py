@@ -200,7 +200,10 @@ class MarkovLosses(AbstractLossLaw):
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds."""
+        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds.
+
+        A lost packet is an `erasure` that nothing passes. `counts`: (arrived, lost) after each past.
+        """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
             shares = self.shares()

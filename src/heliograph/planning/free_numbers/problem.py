@@ -85,7 +85,10 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first."""
+        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first.
+
+        `low`, `high`: ends of each number's range, infinite where there is none.
+        """
         between = np.isfinite(self.low) & np.isfinite(self.high)
         within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
         factor = np.exp(draws.normal(size=len(self.low)))
