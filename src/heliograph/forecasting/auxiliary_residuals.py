@@ -91,6 +91,8 @@ class Disturbances:
         level = float(scalar("false", false, 0, 1))
         residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
         size = np.nan_to_num(np.abs(residuals))
+        # Both sides of each residual that is a number: the probabilities are shared by all these tests
+        # (Bonferroni).
         p = np.minimum(2 * np.isfinite(residuals).sum() * ndtr(-size), 1.0)
         rows = _find_peaks(size.max(axis=1), p.min(axis=1) < level)
         return [self._make_shock(row, residuals[row], p[row], int(size[row].argmax())) for row in rows]
@@ -173,7 +175,10 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
 
 
 def _is_received_unchanged(predicted: Forecast) -> bool:
-    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged."""
+    """Return whether the prediction of what arrives is that of what is measured: the channel hands it on unchanged.
+
+    EQUAL: the largest relative difference, that of rounding.
+    """
     sent, came = predicted.outputs, predicted.received
     return (
         sent is not None
@@ -240,6 +245,8 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
     """Return means (steps, size) and their deviations, NaN where the variance is none but rounding.
 
     `covariance`: (steps, size, size).
+
+    ROUNDING: share of the largest variance over the steps, up to which it is none.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     known = variance > ROUNDING * np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)

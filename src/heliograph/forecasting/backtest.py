@@ -120,7 +120,7 @@ class Backtest:
         if not found:
             known = ", ".join(dict.fromkeys(f"{s.node}/{s.filter} {s.name}" for s in self.scores))
             raise fail("score", f"one of {known} at {list(self.horizons)}", f"{node}/{filter} {name} at {horizon}")
-        return found[-1]
+        return found[-1]  # of a state and a received number of one name the latter, which comes later
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return a table with a row for each score, and columns of means and their standard errors.
@@ -222,7 +222,7 @@ def list_single_filters(network: Network) -> set[tuple[str, str]]:
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
     """Return the measurements that a filter receives (steps, received), of a central one those of all nodes."""
     z = record.measurements.get(target.node)
-    if z is None:  # of a central filter, all nodes' numbers
+    if z is None:  # of a central filter, all nodes' numbers; one that receives nothing has no columns
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
     return z if target.outlook.filter.received else z[:, :0]
 
@@ -349,6 +349,7 @@ def roll_forecasts(
     """
     longest = horizons[-1]
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
+    # Of each row the inputs of the rows after it, (rows, longest, inputs).
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
     arguments = outlook, z, u, windows, np.asarray(horizons) - 1
     rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
@@ -372,14 +373,17 @@ def _forecast_from_each_row(
     filter, length = outlook.filter, windows.shape[1]
 
     def select(moments: Moments | None) -> Moments | None:
-        """Return the moments at `places` of all rows ahead, with variances in the place of covariances."""
+        """Return the moments at `places`, the horizons among all rows ahead, with variances in place of covariances."""
         if moments is None:
             return None
         variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         return Moments(moments.weights[places], moments.means[places], variances[places])
 
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
-        """Return the filter's state after row k, and the moments that it forecasts from there."""
+        """Return the filter's state after row k, and the moments that it forecasts from there.
+
+        `filter`: that of `outlook`, which predicts; `window`: inputs of the `length` rows ahead.
+        """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
         steps_ahead = k + 1 + jnp.arange(length)

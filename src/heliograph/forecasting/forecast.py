@@ -159,13 +159,17 @@ def _take_stacked_state(stacked: PyTree, place: int, several: bool) -> PyTree:
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
-    """Return a filter that only predicts, at a fused estimate; its claim stays where plant and angles allow."""
+    """Return a filter that only predicts, at a fused estimate; its claim stays where plant and angles allow.
+
+    A claim says how far the covariance holds; it is lowered to nominal where a prediction is approximate.
+    """
     plant = first(network.plant)
     linear = isinstance(plant, LinearPlant) and not plant.circular
     claim = estimate.claim if linear or estimate.claim == "none" else weakest([estimate.claim, "nominal"])
     filter = open_loop_filter(network.plant)
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     lowered = replace(filter, claim=claim)
+    # `replace` does not take `kept` along, and the filter is frozen.
     object.__setattr__(lowered, "kept", filter.kept)
     factors = from_covariance if mean.ndim == 1 else _factor_each
     return lowered, factors(mean, covariance if claim != "none" else np.zeros_like(covariance))
@@ -175,7 +179,10 @@ _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covaria
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
-    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary."""
+    """Return the sensor of a node; of what is fused those of all nodes, where they are sensors that do not vary.
+
+    FUSED: the name under which estimates of all nodes together stand.
+    """
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None

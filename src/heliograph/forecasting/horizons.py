@@ -136,7 +136,10 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 
 def _require_step_count(value: object) -> int:
-    """Return a count of steps ahead; raise if there are too many."""
+    """Return a count of steps ahead; raise if there are too many.
+
+    LONGEST: a million steps.
+    """
     count = check_count("horizons", value)
     if count > LONGEST:
         raise fail("horizons", f"at most {LONGEST:,} steps", count)
@@ -153,7 +156,10 @@ def _list_horizons(horizons: object) -> list[object]:
 
 
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
-    """Return how many seconds ahead a span of time or a date is; None of a number."""
+    """Return how many seconds ahead a span of time or a date is; None of a number.
+
+    TIME_STEP: the input dt, the time to the next step; a span or date needs it in seconds. SECOND: nanoseconds.
+    """
     if isinstance(horizon, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
@@ -234,6 +240,9 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
     """Return the time of each horizon on the clock of the data ([plants,] horizons): numbers or dates.
 
     `distances`: how far ahead each is, in steps or if `continuous` in the unit of dt.
+
+    `spacing`: length of a step, of dates in seconds, NaN where none is usual; `months`: how many whole months a
+    step has, 0 if it is none.
     """
     spacing = 1.0 if continuous else origin.spacing
     end = np.asarray(origin.time)[..., None]

@@ -122,7 +122,12 @@ class MultistepPredictor(Module):
             learned = sensor.noise.columns.through(jnp.diag(self.filter.noise_deviations(prior, k)))
 
         def of_part(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the mean and covariance of the outputs, under one part of the mixture of states."""
+            """Return the mean and covariance of the outputs, under one part of the mixture of states.
+
+            `plant`, `sensor`: those of step k; `start`: the plant's second moments at the start; `learned`:
+            the sensor's noise where the filter learns it, else None; `transform`: how moments pass a
+            function that is not linear.
+            """
             signal = find_signal_moments(
                 plant, sensor, self.transform, from_covariance(mean, covariance), start, learned
             )
@@ -156,7 +161,7 @@ def _expect(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
     """Return the innovation of z = 0 at step k: minus what is expected, with the covariance of what arrives."""
     if isinstance(filter, LimitedFilter):
         return _expect(filter.base, filter.hold(prior), k)
-    if isinstance(filter, ToldFilter):  # zeros would tell a law
+    if isinstance(filter, ToldFilter):  # part of z says which law of noise holds: zeros would say one
         return filter.expect(prior, k)
     _, innovation = filter.correct(prior, jnp.zeros(filter.received), k)
     if isinstance(filter, RobustFilter):  # whose law of noise may have no variance
@@ -276,14 +281,21 @@ def make_prediction(moments: Moments, names: tuple[str, ...], claim: Claim, angl
 
 
 def find_output_claim(filter: AbstractFilter, outlook: MultistepPredictor) -> Claim:
-    """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most."""
+    """Return the claim of predicted outputs: that of the states behind a linear sensor, else nominal at most.
+
+    A claim says how far the covariance holds: by a sensor that is not linear, or by angles, it is approximate.
+    """
     sensor = first(outlook.sensor)
     plain = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if plain or filter.claim == "none" else weakest([filter.claim, "nominal"])
 
 
 def find_received_claim(filter: AbstractFilter) -> Claim:
-    """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical."""
+    """Return the claim of what is predicted to arrive: the filter's, but nominal by numbers that are only typical.
+
+    ToldFilter: some of the numbers that arrive say the law of noise. What they will be is not known ahead; typical
+    ones are put for them unless their own law is known.
+    """
     base = filter.base if isinstance(filter, LimitedFilter) else filter
     if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
         return weakest([filter.claim, "nominal"])

@@ -34,7 +34,10 @@ class ResidualQuantiles(NamedTuple):
 
 
 def compare_with_normal_quantiles(e: np.ndarray) -> ResidualQuantiles:
-    """Return the quantiles of residuals (steps,), NaN where none came: the i-th of n is Beta(i, n + 1 - i) in law."""
+    """Return the quantiles of residuals (steps,), NaN where none came: the i-th of n is Beta(i, n + 1 - i) in law.
+
+    The band leaves OUTSIDE beyond each side; `ndtri` is the quantile function of the normal law.
+    """
     came = np.sort(e[~np.isnan(e)])
     n = len(came)
     place = np.arange(1, n + 1)

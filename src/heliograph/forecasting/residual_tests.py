@@ -57,7 +57,11 @@ class Residuals:
     variance: Array
 
     def doubts(self) -> list[str]:
-        """List what speaks against the model, a line each, with the number of tests in mind."""
+        """List what speaks against the model, a line each, with the number of tests in mind.
+
+        A p-value speaks against it below FALSE over the number of tests: FALSE is the probability of any wrong
+        doubt.
+        """
         tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
                  "of a variance that changes": self.variance}  # fmt: skip
         made = sum(int(np.sum(np.isfinite(p))) for p in tests.values())
@@ -193,7 +197,10 @@ def _compute_autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
 
 
 def _test_correlation(e: np.ndarray, lags: int) -> float:
-    """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, n_l pairs of lag l: chi-squared if all r_l are zero."""
+    """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, n_l pairs of lag l: chi-squared if all r_l are zero.
+
+    NaN where fewer than LEAST residuals came.
+    """
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:
         return float("nan")
@@ -202,7 +209,10 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
 
 
 def _test_normality(e: np.ndarray) -> float:
-    """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis of residuals (steps,)."""
+    """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, S the skewness and K the kurtosis of residuals (steps,).
+
+    The number is chi-squared with 2 degrees of freedom if they are normal. NaN where fewer than LEAST came.
+    """
     came = e[~np.isnan(e)]
     if len(came) < LEAST:
         return float("nan")
@@ -211,7 +221,11 @@ def _test_normality(e: np.ndarray) -> float:
 
 
 def _test_same_variance(e: np.ndarray) -> float:
-    """Return the two-sided p-value of the ratio of the sums of squares in the last and in the first third."""
+    """Return the two-sided p-value of the ratio of the sums of squares in the last and in the first third.
+
+    Of the residuals that came, h in a third: the ratio has the F law of h and h degrees of freedom if the variance
+    is one. NaN where h is less than half of LEAST.
+    """
     came = e[~np.isnan(e)]
     h = len(came) // 3
     if h < LEAST // 2:

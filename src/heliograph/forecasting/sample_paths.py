@@ -137,6 +137,8 @@ class ModeSwitching(NamedTuple):
         """Return the mode of step k, drawn by the chain from that of the step before, or that one itself.
 
         It stays at the first of all steps unless the chain has `moved` before. `u`: inputs of the step.
+
+        `moved`: whether the filter has predicted before; if not, its modes are already those of the first step.
         """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
         rows = transition_over(plant, u, jnp.asarray(channel.transition))
@@ -239,7 +241,11 @@ def _draw_paths_from_states(
         return (x, mode), (x, y)
 
     def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path."""
+        """Return the states (rows, n) and outputs (rows, m) of one path.
+
+        `start`: state and mode; `u`: inputs of the rows ahead; `step`: number of the first of them; `move`: a
+        step of a path.
+        """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array] = jax.lax.scan(lambda before, row: move(before, row, key), start, rows)[1]
         return path

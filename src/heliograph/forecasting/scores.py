@@ -30,7 +30,10 @@ def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarra
 
 
 def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return the log density of what came (rows,), in nats: the larger the better."""
+    """Return the log density of what came (rows,), in nats: the larger the better.
+
+    LOG_TURN: log(2 pi). The largest term is taken out of the sum, lest every exponential is 0.
+    """
     terms = (
         np.log(law.weights)
         - ((values[:, None] - law.means) ** 2 / law.variances + np.log(law.variances) + LOG_TURN) / 2
@@ -74,6 +77,8 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
 
     Forecasts from neighbouring rows share what happens in between, so errors of horizon h are correlated over h - 1
     rows at least. Var = n^-2 sum_l w_l sum_t d_t d_{t+l} with Bartlett's weights over max(h - 1, 1.3 sqrt n) lags.
+
+    BANDWIDTH: that 1.3.
 
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
     """

@@ -86,7 +86,10 @@ def _stack_trees(trees: list[PyTree]) -> PyTree:
 
 
 def _stack_estimates(estimates: list[Estimate]) -> Estimate:
-    """Return estimates of single plants as one of several plants, with the claim of the first that claims anything."""
+    """Return estimates of single plants as one of several plants, with the claim of the first that claims anything.
+
+    Of plants with another claim the covariances are NaN.
+    """
     claimed = next((one for one in estimates if one.claim != "none"), estimates[0])
     covariances = [
         np.asarray(one.covariance) if one.claim == claimed.claim else np.full(np.shape(claimed.covariance), np.nan)

@@ -57,6 +57,7 @@ class Crossing:
             ValueError: a level that is no probability between 0 and 1.
         """
         p = float(scalar("level of a quantile", level, 0, 1))
+        # `by`: probability to have been beyond by each of the `steps`.
         reached = np.flatnonzero(self.by >= p)
         return float(self.steps[reached[0]]) if len(reached) else float("inf")
 

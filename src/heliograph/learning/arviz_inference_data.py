@@ -66,7 +66,11 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 
 
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
-    """Return the free numbers of the table by name at points of the line (draws, p), as a dataset."""
+    """Return the free numbers of the table by name at points of the line (draws, p), as a dataset.
+
+    The line: unbounded coordinates of the free numbers, such as logarithms of variances. All draws are one chain,
+    axis 0.
+    """
     values = np.stack([solution.parameters.entries_at(x) for x in points])
     names = [entry.name for entry in solution.parameters.entries]
     return _make_dataset({name: (("chain", "draw"), values[None, :, i]) for i, name in enumerate(names)})

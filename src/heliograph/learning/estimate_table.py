@@ -155,7 +155,7 @@ class Solution:
 
     @cached_property
     def rank(self) -> InformationRank:
-        """Flat directions at the maximum, among active coordinates, as many as the ridges."""
+        """Directions of active coordinates on which the data say nothing at the maximum (flat): as many as `ridges`."""
         return find_rank_of_late_rows(
             self.surface.evaluations(self.top.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges
         )
@@ -182,7 +182,7 @@ class Solution:
 
     @cached_property
     def few(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates are real numbers told by a few stretches of the data, as a step is (active,)."""
+        """Which active coordinates (active,) are real numbers that few spans of the data tell, as a step is."""
         places = np.flatnonzero(self.active & self.surface.domains.free)
         few = np.zeros(len(self.active), dtype=bool)
         if len(places) and not self.rank.flat.size:
@@ -324,14 +324,14 @@ class Solution:
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Return whether the data identify a function of the numbers, which it is if it does not change along ridges.
 
-        `slopes`: its derivatives by the active coordinates (active,).
+        `slopes`: its derivatives by the active coordinates (active,), of which a share ALONG may lie on a ridge.
         """
         along = self.rank.unit * slopes
         size = np.linalg.norm(along)
         return bool(size > 0 and np.linalg.norm(along @ self.rank.flat) <= ALONG * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return both ends of an interval, relative to the estimate, by sums of blocks of scores that are drawn anew.
+        """Return both ends of an interval, relative to the estimate, by DRAWS sums of blocks of scores drawn anew.
 
         `slopes`: derivative of the number by the active coordinates (active,); a draw moves the maximum by H^-1 times
         the sum.
@@ -363,7 +363,7 @@ class Solution:
     def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
         """Return where the profile of a coordinate has fallen by `drop` nats, one end for each of `first`.
 
-        `first`: signed distances from the maximum at which the search for each end begins.
+        `first`: signed distances from the maximum at which the search for each end begins; END, REAL_END: its limits.
         """
         furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
         return self.surface.find_profile_crossings(

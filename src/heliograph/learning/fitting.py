@@ -341,6 +341,7 @@ def _maximise_forms(
 def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Return recordings with tables of events turned into rows, and {node: law of its delays} of these tables."""
     several = recording if isinstance(recording, list) else [recording]
+    # Tables of events alone know how late each message came.
     tables = [table for table in several if hasattr(table, "lateness")]
     if not tables:
         return recording, {}

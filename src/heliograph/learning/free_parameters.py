@@ -39,7 +39,10 @@ class Parameter:
 
     @property
     def entry_names(self) -> tuple[str, ...]:
-        """Return the names of its entries in the table; of a covariance those on and below the diagonal."""
+        """Return the names of its entries in the table; of a covariance those on and below the diagonal.
+
+        `start`: the value of the number from which a search begins, which has its shape.
+        """
         if self.start.ndim == 0:
             return (self.name,)
         indices = np.ndindex(self.start.shape)
@@ -57,7 +60,11 @@ class Parameter:
             return np.asarray(self._trace_entries(np.asarray(x)))
 
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line."""
+        """Return the derivatives (entries, size) of the entries at a point x (size,) of the line.
+
+        Entries of an interval have a coordinate each, so that theirs is a diagonal matrix; of others JAX
+        differentiates.
+        """
         if self.domain.kind == "interval":
             return np.diag(slope_from_line(self.domain, x))
         with jax.enable_x64(True):
@@ -69,7 +76,10 @@ class Parameter:
 
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
-        """Return the domain of each of its entries in the table."""
+        """Return the domain of each of its entries in the table.
+
+        Entries of a simplex are probabilities; of a covariance those on the diagonal are positive, the others real.
+        """
         if self.domain.kind == "simplex":
             return (PROBABILITY,) * self.start.size
         if self.domain.kind == "covariance":
@@ -103,7 +113,7 @@ class Parameters:
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Return the coordinates of all starts."""
+        """Return the coordinates (p,) on the unbounded line at which all free numbers start."""
         return np.concatenate(
             [map_to_line(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
@@ -121,7 +131,11 @@ class Parameters:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Return the names of all coordinates."""
+        """Return the names of all coordinates on the unbounded line.
+
+        A number of an interval has a coordinate for each entry, of the entry's name; those of a simplex or a
+        covariance are numbered, NAME(0), NAME(1), ...
+        """
         return tuple(
             parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
             for parameter in self.every
@@ -156,7 +170,11 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives (entries, p) of the entries, mapped to the line by `link`, by the coordinates x."""
+        """Return the derivatives (entries, p) of the entries by the coordinates x (p,), each entry taken on the line.
+
+        On the line an entry is its logarithm or logit where its domain has ends. No warnings: at an end the
+        derivative may be infinite.
+        """
         pairs = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):
             return np.stack([slope_to_line(entry.domain, value) * row for entry, value, row in pairs])

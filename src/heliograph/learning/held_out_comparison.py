@@ -154,7 +154,12 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
 
 
 def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> PredictedRows:
-    """Return a filter's predictions of the rows from `cut` on, by measurements z and inputs u of all rows."""
+    """Return a filter's predictions of the rows from `cut` on, by measurements z and inputs u of all rows.
+
+    `likelihood`: log density of each row; `white`: innovations over their predicted deviations, which are white
+    noise if the filter is right. They are tested for correlation over LAGS rows at most, or not where they are too
+    few (None).
+    """
     likelihood, white = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(white) // 10)
     has_enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
@@ -176,6 +181,7 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
     """
     for name, law in (("first law", a), ("second law", b)):
         instance(name, law, Predictive, "what `predictive` gives")
+    # NaN among the transforms `pit` says that nothing arrived: in one recording it is so at the same places.
     if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
         raise fail("second law", "the same recording as the first", "another")
     received = ~np.all(np.isnan(a.pit), axis=1)

@@ -54,6 +54,7 @@ def compare_likelihoods(larger: float, smaller: float, freedom: int) -> FitTest:
     """
     if freedom < 1:
         raise fail("smaller model", "one of fewer free numbers", f"{-freedom} more" if freedom else "as many")
+    # ROUNDING: nats by which the search for the larger model may have ended too low.
     if smaller > larger + ROUNDING:
         raise fail(
             "smaller model", f"a log-likelihood of at most {larger:.6g}, as part of the larger one", f"{smaller:.6g}"
@@ -78,6 +79,7 @@ def wald_test(
     if not asked or set(asked) - set(estimates):
         raise fail("values", f"numbers for some of {list(estimates)}", list(asked))
     places = [list(estimates).index(name) for name in asked]
+    # Numbers at a boundary, or not identified, have NaN as covariance.
     inner = covariance[np.ix_(places, places)]
     if not np.isfinite(inner).all():
         raise fail("values", "numbers that are identified and not at a boundary", list(asked))

@@ -109,7 +109,8 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
 def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """Return what a recording identifies of the free numbers, by its information at three points around a start (p,).
 
-    Points at which that is not finite are left out.
+    `late`: the information of the recording's second half, where what is known before the first step counts least.
+    Points at which it is not finite are left out; if it is finite at none, the start alone is judged.
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -130,7 +131,11 @@ def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
 def _judge_identifiability(
     parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
 ) -> Identifiability:
-    """Return the identifiability by the ranks of the information at several points (p,), with its sentences."""
+    """Return the identifiability by the ranks of the information at several points (p,), with its sentences.
+
+    `flat`: directions in columns on which the data say nothing. `ridges`: how many there are where they are fewest;
+    `weakest`: the largest, over the points, of the smallest information in any other direction.
+    """
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
@@ -320,6 +325,7 @@ def _compute_link_moments(sensor: AbstractSensor, link: AbstractRandomAffine) ->
     """
     moments, r = second_order(link), jnp.asarray(sensor.noise.covariance)
     mean, p = jnp.asarray(moments.mean_gain), moments.mean_gain.shape[1]
+    # Covariances [i, j, a, b] of entries (i, a) and (j, b) of (gain, constant part), the constant part last.
     spread = jnp.asarray(moments.nominal.center)
     whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
     noise = jnp.diagonal(mean @ r @ mean.T + contract(spread, whole))

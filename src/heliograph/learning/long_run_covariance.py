@@ -46,6 +46,8 @@ def find_numbers_told_by_few_stretches(information: list[Float[np.ndarray, "step
     `information`: of each recording that of each row on each number (steps, k). With the information V_b of stretch b,
     (sum_b V_b)^2 / sum_b V_b^2 is the number of stretches if all tell the same, and 1 if one tells all. The scores of
     such numbers vary within a few stretches alone, in which cosines hardly change: they see next to nothing of it.
+
+    Stretches: spans of rows, as many as cosines are used. Few: that number is less than the share FEW of them all.
     """
     by_recording = []
     for rows in information:

@@ -87,7 +87,10 @@ _reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbe
 
 @contextmanager
 def answer_free_marks_by(reader: _FreeNumberReader) -> Iterator[None]:
-    """Let `reader` answer all calls of `free` inside the block."""
+    """Let `reader` answer all calls of `free` inside the block.
+
+    `_reader`: the variable of this context in which calls of `free` find who answers them.
+    """
     token = _reader.set(reader)
     try:
         yield
@@ -99,12 +102,21 @@ class _MarkedNumber:
     """A free number while it is being collected: its start, name, and the domain that its places leave it."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
+        """Keep start, name (`given`, None without one) and the domain that a kind means.
+
+        `explicit`: the user gave the kind, so that its place does not narrow the domain. `place`: where the
+        number stands, to be reported.
+        """
         self.start, self.given, self.place = start, name, ""
         self.domain = None if kind is None else DOMAINS[kind]
         self.explicit = kind is not None
 
     def report(self, name: str, domain: Domain) -> None:
-        """Note the number's place, and narrow its domain to what the check there requires."""
+        """Note the number's place, and narrow its domain to what the check there requires.
+
+        A kind that the user gave stays. Of two intervals what both allow is kept; a check that requires nothing
+        (REAL) changes nothing; any other domain replaces the one known.
+        """
         self.place = self.place or name
         if self.explicit:
             return
@@ -123,7 +135,11 @@ class FreeNumberCollector:
         self.marks: list[_MarkedNumber] = []
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the start, marked so that checks of its place report the domain."""
+        """Return the start, marked so that checks of its place report the domain.
+
+        `marks`: the numbers met so far. A name that was met before is that number again, which has to have the same
+        start.
+        """
         for mark in self.marks:
             if name is not None and mark.given == name:
                 if not np.array_equal(mark.start, start):
@@ -155,7 +171,10 @@ class ValueReader:
         self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the value of this name, or of the next number without a name."""
+        """Return the value of this name, or of the next number without a name.
+
+        `unnamed`: names that the numbers without one were given, in the order in which the function marks them.
+        """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
             raise fail(

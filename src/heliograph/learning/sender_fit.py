@@ -139,7 +139,11 @@ def fit_sender(
     data = gather_data(description.start, recording, inputs, parameters.size)
 
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood of all recordings at a point of the line."""
+        """Return the log-likelihood of all recordings at a point of the line.
+
+        `data`: recordings side by side, of which the first `lengths` rows count. IMPOSSIBLE: a very low number
+        in place of -inf or NaN, since a search needs one.
+        """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
@@ -178,7 +182,10 @@ def _search_from_starts(
     best: _BestPoint | None = None  # of all evaluations
 
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
-        """Return the log-likelihood at a point, and keep the best point so far."""
+        """Return the log-likelihood at a point, and keep the best point so far.
+
+        `best` keeps it as not converged, to be returned if the search is stopped.
+        """
         nonlocal best
         total = likelihood(x)
         if best is None or total > best.total:
@@ -257,6 +264,9 @@ def _make_row_without_interval(description: Description, x: Float[np.ndarray, " 
 def _add_interval(row: Row, description: Description, likelihood: Likelihood, top: "_BestPoint", index: int) -> Row:
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
+    The profile is the log-likelihood maximised over all other coordinates; the interval ends where it has fallen to a
+    level. NORMAL: 1.96 standard errors from the middle to either end of 95 %.
+
     Args:
         row: the row without an interval.
         description: the network with its free numbers.
@@ -327,6 +337,10 @@ class _Profile(NamedTuple):
         """Return whether the profile at a value is above the level, and its point there, searched from one nearby.
 
         The first simplex is as large as the two values are apart.
+
+        Profile: the log-likelihood with this coordinate held at the value and maximised over the others. The
+        search stops as soon as it is above `level`. NEAR, LARGEST_SIMPLEX: accuracy on the line, and the
+        largest first simplex.
         """
         size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
         best = _climb_simplex(

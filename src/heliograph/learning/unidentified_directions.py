@@ -92,6 +92,7 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
         if entry.coordinate is not None:
             slopes[entry.coordinate] = row[entry.coordinate]
             log[entry.coordinate] = row[entry.coordinate] / value if value else np.nan
+    # A number that is 0 has no logarithm: its derivative is put as 0.
     return slopes, np.nan_to_num(log)
 
 
@@ -105,7 +106,10 @@ def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...
     """Return the groups of coordinates that a flat direction at any point connects.
 
     `bases`: orthonormal flat directions at each point, in columns.
+
+    A group of one coordinate is one that no data tell.
     """
+    # An entry of the projector b b' is not 0 where some flat direction moves both coordinates.
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
     count, labels = connected_components(joined, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
@@ -140,9 +144,12 @@ def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
     """Return the combinations, in rows, that no flat direction of any point changes, in reduced row echelon form.
 
     `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these.
+
+    SAME: singular value that is rounding.
     """
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))
+    # Right singular vectors beyond the rank are orthogonal to all flat directions.
     return _reduce_to_echelon(right[rank:])
 
 
@@ -181,7 +188,10 @@ def format_product(names: list[str], exponents: Float[np.ndarray, " places"]) ->
 
 
 def format_sum(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
-    """Return the text of a weighted sum, such as "a + 0.64 b"."""
+    """Return the text of a weighted sum, such as "a + 0.64 b".
+
+    Weights within SAME of 1 are not written, nor are those of 0.
+    """
     text = ""
     for name, weight in zip(names, weights, strict=True):
         if weight:

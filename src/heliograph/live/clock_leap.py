@@ -54,13 +54,20 @@ class ClockLeap(NamedTuple):
         """Return this leap, believed; one that follows an earlier believed one is joined with that into one leap.
 
         Not with the leap with which the plant begins (`now` is -inf), which has no time before it.
+
+        Believed: rows become final by it, although no other clock confirms it. `back`: time of a message that
+        spoke against it; `since`: the first moment after the newest of leaps that are joined.
         """
         if self.earlier is None or self.earlier.now == -inf:
             return self._replace(believed=True, back=None)
         return self.earlier._replace(since=self.since, back=None)
 
     def with_back(self, of: "ClockLeap", back: float | None) -> "ClockLeap":
-        """Return this leap with its `back` set in that leap of its chain which is `of`."""
+        """Return this chain of leaps, in which the leap `of` has this `back`.
+
+        `back`: time of a message that goes on from before the leap, a first sign that it was none; None without
+        one. `earlier`: the leap before this one in the chain.
+        """
         if self is of:
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
@@ -69,6 +76,9 @@ class ClockLeap(NamedTuple):
         """Return whether `clock` takes the leap back by saying `time`, which lies between the leap's two sides.
 
         `now`: the newest arrival after it.
+
+        `believed`: rows become final by it; `since`: the first moment after the newest of leaps that are
+        joined; `back`: time of the first message by its own clock that went on from before it.
         """
         if not self.believed:
             return True
@@ -86,6 +96,9 @@ def find_contradicted_leap(
     """Return the leap that `time` contradicts by lying before it, and the newest arrival after it; None if none.
 
     A time contradicts a leap if it is later than all before the leap, but more than `most` before its far side.
+
+    In a leap time goes on by more than `most` at once, from the newest arrival before it (`leap.now`) to its far
+    side (`leap.time`).
 
     Args:
         leap: the newest of the chain, None if there is none.

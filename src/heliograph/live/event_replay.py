@@ -93,6 +93,7 @@ class _LaggedSmoother:
     """
 
     def __init__(self, timeline: Timeline, lag: float):
+        """Keep the timeline, and the lag after which each of its moments is smoothed into `smoothed`."""
         self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
         self._timeline, self._lag = timeline, lag
         self._waiting: list[float] = []  # a heap of moments of which the lag has not passed
@@ -103,7 +104,10 @@ class _LaggedSmoother:
             heappush(self._waiting, moment)
 
     def smooth_until(self, arrival: float) -> None:
-        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it."""
+        """Smooth each moment noted whose lag ends before `arrival`: nothing that comes from then on can change it.
+
+        `_waiting`: a heap of moments to smooth, the earliest first; `window`: the longest lag that the timeline has.
+        """
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
             moment = heappop(self._waiting)

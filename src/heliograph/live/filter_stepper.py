@@ -73,7 +73,10 @@ class NativeFilterStepper:
             leaf_of_state[...] = leaf
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite."""
+        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite.
+
+        The compiled code reads z, u and k from these arrays, and writes whether it objects (`_flagged`).
+        """
         self._z[...], self._u[...], self._k[...] = z, u, k
         self._code()
         return not self._flagged
@@ -118,7 +121,10 @@ class XlaFilterStepper:
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
-        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite."""
+        """Compute step k from z and u; return False, with the state unchanged, if these are implausible or infinite.
+
+        `_run`: the compiled step; `_tree`: structure of the state; `accept` puts the state after in the state's place.
+        """
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
             judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
@@ -169,6 +175,7 @@ def compile_xla_step(static: Static) -> Any:
     """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k)."""
 
     def step(*data: PyTree) -> PyTree:
+        """Return what `_judge_step` returns for the data (numbers, state, z, u, k) of the filter `static`."""
         return _judge_step(static, *data)
 
     return jax.jit(step, compiler_options=understood())
@@ -210,7 +217,11 @@ def _compile_step(
     state_end = number_count + state_count
 
     def step(*arguments: jax.Array) -> PyTree:
-        """Return judgement, whether to refuse, state after, estimate, and what takes the state's place."""
+        """Return judgement, whether to refuse, state after, estimate, and what takes the state's place.
+
+        `arguments`: arrays of the filter, leaves of its state, z, u and k; the first two end at `number_count`
+        and `state_end`. `tree`: the state's structure; `static`: the filter without its arrays.
+        """
         numbers, before = arguments[:number_count], arguments[number_count:state_end]
         z, u, k = arguments[state_end:]
         judged, flagged, after, estimate = _judge_step(static, numbers, tree.unflatten(before), z, u, k)
@@ -292,7 +303,11 @@ class CompiledFilter:
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior."""
+        """Return a new stepper whose state is the prior.
+
+        By native code (`code`) where there is some for the filter, else by XLA. `_start`: the prior as state; `_static`
+        and `numbers`: the filter without its arrays, and these.
+        """
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:
             return XlaFilterStepper(compile_xla_step(self._static), self.numbers, self._start)

@@ -17,7 +17,10 @@ class FinalRows:
         self._count = 0  # rows of all parts
 
     def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
-        """Append the outputs of some rows."""
+        """Append the outputs of some rows.
+
+        The oldest parts are dropped as long as `most` rows are left without them.
+        """
         self._parts.append((time, rows))
         self._count += len(time)
         while self._count - len(self._parts[0][0]) >= self.most:
@@ -25,6 +28,7 @@ class FinalRows:
 
     def take_all(self) -> tuple[np.ndarray, Float[np.ndarray, "row output"]]:
         """Remove and return all times and rows."""
+        # An empty part first, for where there are no others.
         times, rows = zip((np.zeros(0), np.zeros((0, self.size))), *self._parts, strict=True)
         self._parts.clear()
         self._count = 0

@@ -100,7 +100,7 @@ class Fleet:
         return self._joint
 
     def begin_plant(self, name: str, time: float, origin: datetime | None) -> PlantState:
-        """Return a new plant with the prior alone.
+        """Return a new plant whose only row is the prior, in a slot (row number) of the table.
 
         Continuous time starts at `time`, where the prior stands; steps start at 0, and the prior is of step -1.
         `origin`: date from which times are counted, None if they are numbers.
@@ -137,7 +137,7 @@ class Fleet:
         self._step_chains(chains)
 
     def end_silence(self, plant: PlantState) -> None:
-        """Forget the silence of a plant."""
+        """Forget the row that was predicted for the silence of a plant, and free its slot in the table."""
         if plant.silence is not None:
             self.pool.free_slots([plant.silence.slot])
             plant.silence = None
@@ -296,7 +296,7 @@ class Fleet:
     def finalise_plants(self, touched: Iterable[PlantState], all_: bool = False) -> list[FinalisedPlant]:
         """Step what is due, and let rows older than the window, or all, become final; return what did of each plant.
 
-        `touched`: the plants that have taken events, or whose time went on.
+        `touched`: plants that have taken events, or whose time went on. Rows before the watermark become final.
         """
         plants, results = list(touched), []
         self.step(plants)

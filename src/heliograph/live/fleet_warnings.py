@@ -22,7 +22,10 @@ class RemarkWatch:
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
-        """Yield the name of a plant and a line for each filter that has something new to say."""
+        """Yield the name of a plant and a line for each filter that has something new to say.
+
+        `said.times`: how often the filter has had it to say; `remarked`: how often that was passed on.
+        """
         for plant in plants if self.counts else ():
             for place, said in self._read_remarks(plant.rows.held[-1]).items():
                 new = said.times - plant.remarked.get(place, 0)
@@ -36,7 +39,10 @@ class RemarkWatch:
         plant.remarked = {place: said.times for place, said in self._read_remarks(plant.rows.held[-1]).items()}
 
     def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
-        """Return the remark of each filter on its state after a row, by node and filter."""
+        """Return the remark of each filter on its state after a row, by node and filter.
+
+        `counts` has an entry for each filter that can say anything.
+        """
         if not self.counts:
             return {}
         return self._steps.read_remarks(self._pool.table[row.slot, self._pool.state])
@@ -50,7 +56,11 @@ class FleetRepeatWatch:
         self._said = set[tuple[str, int]]()  # node and output
 
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
-        """Yield the name of a plant and a line for each output that repeats for too long for the first time."""
+        """Yield the name of a plant and a line for each output that repeats for too long for the first time.
+
+        An output of a node is named once, by the first plant of which it is found. `found`: by output, how many
+        runs of equal readings were too long.
+        """
         for plant in plants if self._watches else ():
             for node, link in plant.links.items():
                 for output in [i for i, count in enumerate(link.repeats.found) if count]:

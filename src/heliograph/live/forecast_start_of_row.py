@@ -38,7 +38,11 @@ def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.n
 
 
 def estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> dict[str, dict[str, Estimate]]:
-    """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs)."""
+    """Return the estimates of a row, or of rows, by node and filter, from its outputs (..., outputs).
+
+    `filter_columns`: for each filter where its mean, covariance and modes' probabilities stand among the outputs. A
+    claim is lowered where the covariance is not sound.
+    """
     n, attitude = len(program.network.states), first(program.network.plant).manifold.rotations
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in program.claims}
     for columns in program.filter_columns:

@@ -102,7 +102,11 @@ class JudgementReader:
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
     def _find_flagged(self, taken: Sequence[CandidateEvent]) -> list[int]:
-        """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none."""
+        """Return the indices of the candidates in whose rows any filter's judgement raises a flag; most raise none.
+
+        FLAGS: numbers of a judgement, above 0 where it objects to a measurement, or to inputs. A slot is the
+        number of a row in the table.
+        """
         pool, slots = self.fleet.pool, np.array([candidate.row.slot for candidate in taken])
         flags = pool.outputs.start + self._all_columns[:, FLAGS].ravel()
         flagged: list[int] = np.flatnonzero((pool.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
@@ -114,6 +118,7 @@ class JudgementReader:
         outputs = pool.table[candidate.row.slot, pool.outputs]
         if event.is_inputs:
             return self.explain_inputs(outputs)
+        # No number came that could be implausible.
         if _find_largest_number(event) < 0:
             return None
         return Judgement.why_values(outputs[self._judgement_columns[event.node_index]])
@@ -152,7 +157,11 @@ class JudgementReader:
         return rows.held[rows.find_index(candidate.row.key) - 1]
 
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
-        """Return what a filter estimated after a row, from its columns; before all events its initial estimate."""
+        """Return what a filter estimated after a row, from its columns; before all events its initial estimate.
+
+        BEFORE: in place of a node, what stands before all events. `columns`: where mean and covariance begin among the
+        outputs.
+        """
         if row.key[1] == BEFORE:  # no estimate was computed there
             return filter.estimate(filter.init())
         n, outputs = len(filter.states), self.fleet.pool.table[row.slot, self.fleet.pool.outputs]

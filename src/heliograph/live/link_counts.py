@@ -70,7 +70,7 @@ class LinkCounts:
     timeouts: int = 0
 
     def __post_init__(self) -> None:
-        """Take runs of equal readings, and what was refused, as they were stored."""
+        """Take runs of equal readings, and what was refused (one number until version 0.4.0), as they were stored."""
         self.repeats = Repeats.read(self.repeats)
         if isinstance(self.refused, int):
             self.refused = {"limits": self.refused} if self.refused else {}
@@ -103,6 +103,7 @@ class LinkCounts:
 
         `period`: after how many messages the count begins at 0 again; 0 if it does not.
         """
+        # There is a count of the name of each verdict.
         setattr(self, verdict, getattr(self, verdict) + 1)
         self._follow_sequence(verdict, sequence, time, period)
 
@@ -158,6 +159,9 @@ class LinkCounts:
 
         It is the nearest one to `newest`, above it for a message measured later and below it for one before; where that
         is more than GAP away the node was restarted, and its own count is returned.
+
+        `newest`: the greatest count so far, -1 before the first, of a message measured at time `at`. GAP: most messages
+        that may be lost in a row.
         """
         if not period or self.newest < 0:
             return sequence
@@ -170,6 +174,9 @@ class LinkCounts:
         """Count `count` used messages, whose clock was wrong, as ones from the future instead.
 
         `before`: `at` and `latest` before the first of these; None where it was the node's first.
+
+        `at`: time of the measurement with the greatest running count; `latest`: time of the newest that was
+        used.
         """
         self.at, self.latest = before or (0.0, -1.0)
         self.used, self.future = max(self.used - count, 0), self.future + count

@@ -30,7 +30,10 @@ class FactorPlaces(NamedTuple):
 
 
 def find_factor_places(places: PyTree) -> list[FactorPlaces]:
-    """Return the places of all factors in a row, from the tree of a state whose leaves are their own places."""
+    """Return the places of all factors in a row, from the tree of a state whose leaves are their own places.
+
+    LOWER, VARIANCES: how the paths of the factors L and D of a covariance end.
+    """
     parts = {path: part.astype(int) for path, part in split_by_path(places).items()}
     stems = [path.removesuffix(VARIANCES) for path in parts if path.endswith(VARIANCES)]
     return [FactorPlaces(parts[stem + LOWER], parts[stem + VARIANCES]) for stem in stems if stem + LOWER in parts]
@@ -145,6 +148,8 @@ def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int
 
     Numbers that moved over the last quarter of the probes as they did over the quarter before go on at this rate; all
     others stay.
+
+    PROBED: steps of a probe; STEADY: relative difference between the two changes that counts as none.
     """
     quarter = len(passed) // 4
     end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
@@ -167,7 +172,10 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
-    """Return the mask of a state's numbers that changed by more than rounding; NaN that stays NaN did not."""
+    """Return the mask of a state's numbers that changed by more than rounding; NaN that stays NaN did not.
+
+    SETTLED: relative change that is rounding.
+    """
     with np.errstate(invalid="ignore"):
         close = np.abs(after - before) <= SETTLED * np.maximum(np.abs(before), np.abs(after))
     moving: np.ndarray = ~(close | (before == after) | (np.isnan(before) & np.isnan(after)))

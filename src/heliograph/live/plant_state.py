@@ -124,6 +124,7 @@ class PlantState:
         leap, newest = found
         if agreed or leap.is_taken_back_by(clock, time, newest):
             self.undo_leap(leap, longest_gap, names)
+        # A first message of its own clock that goes on from before it: the next may take it back.
         elif clock == leap.clock:
             self.leap = self.leap.with_back(leap, time)
 
@@ -154,7 +155,11 @@ class PlantState:
         self.now, self.leap = max(newest, now), leap
 
     def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
-        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed."""
+        """Return what is left of a leap after an event on its far side at `time` by `clock`: None once confirmed.
+
+        By another clock it is confirmed at once, by its own if the plant has gone on for as long as it leapt
+        (`is_over`). INPUTS: no clock of its own; ARRIVAL: the clock by which arrivals are dated.
+        """
         if clock != leap.clock:
             return None
         if leap.is_over(self.now):
@@ -203,6 +208,7 @@ class PlantState:
             for node, _, _ in row.events:
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
+            # `moments`: times of the node's counts before the leap.
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
     def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
@@ -210,7 +216,10 @@ class PlantState:
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
-        """Return the events of leaps that were taken back since the last call, and the slots of their rows."""
+        """Return the events of leaps that were taken back since the last call, and the slots of their rows.
+
+        Withdrawn events are those that a wrong clock had made, known by a later message.
+        """
         leaps, self.aside = self.aside, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
         return events, [row.slot for leap in leaps for row in leap.gone]
@@ -266,6 +275,9 @@ class PlantState:
         """Undo the changes since the last finalisation; return the slots that are free again.
 
         Rows that had been stepped since become dirty.
+
+        `aside`: what each leap that was taken back had removed; `kept`: the row from before a leap; `dirty`: index of
+        the first row to step again; base: the first held row, which is final.
         """
         slots, keys = list[int](), [row.key for row, _ in self.changes]
         # Newest first: what changed after each leap that was taken back, then this itself.
@@ -281,7 +293,10 @@ class PlantState:
         return slots
 
     def _undo_since(self, count: int) -> list[int]:
-        """Undo the changes after the first `count`, newest first; return the slots that are free again."""
+        """Undo the changes after the first `count`, newest first; return the slots that are free again.
+
+        A change: a row, and its numbers and events before, None if there was no such row.
+        """
         slots = []
         for row, before in reversed(self.changes[count:]):
             if before is None:  # the row was new
@@ -293,14 +308,17 @@ class PlantState:
         return slots
 
     def link_counts(self, node: str) -> LinkCounts:
-        """Return the counts of a node."""
+        """Return the counts of a node's messages; new ones if it has none yet."""
         link = self.links.get(node)
         if link is None:
             link = self.links[node] = LinkCounts()
         return link
 
     def take_dirty_rows(self) -> list[HeldRow]:
-        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none."""
+        """Return the rows to step again, behind the row from which they start, and call them up to date; [] if none.
+
+        `dirty`: index of the first held row to step again, None if all are up to date. The base, index 0, never is.
+        """
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None
         return chain
@@ -309,6 +327,9 @@ class PlantState:
         """Make rows before the watermark final; return them and the slots that are no longer needed.
 
         `longest_gap`: longest gap that is no leap; of the rows before a leap the newest is kept.
+
+        Watermark: time up to which rows become final. Base: the newest final row, from which the others are
+        stepped. `forced`: rows that became final early, for lack of room.
         """
         self.changes = []
         base, forced = self.rows.find_base(watermark)
@@ -337,7 +358,11 @@ class PlantState:
 
     @property
     def slots(self) -> list[int]:
-        """Return all slots of the plant."""
+        """Return all slots of the plant.
+
+        A slot is the number of a row in the table. `kept`: the row from before a leap; `gone`: rows removed as
+        a leap was taken back.
+        """
         kept = [] if self.kept is None else [self.kept.row]
         gone = [row for leap in self.aside for row in leap.gone]
         return [row.slot for row in (*self.rows.held, *kept, *gone)]

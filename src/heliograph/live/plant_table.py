@@ -50,6 +50,7 @@ class SlotTable:
     def take_slot(self) -> int:
         """Take a free slot."""
         if not self._free:
+            # Double the table; the new slots are free, and the lowest is taken first.
             count = len(self.table)
             self.table = np.concatenate([self.table, np.zeros_like(self.table)])
             self._free = list(range(2 * count - 1, count - 1, -1))
@@ -60,7 +61,10 @@ class SlotTable:
         self._free += slots
 
     def write_prior(self, slot: int, time: float) -> None:
-        """Fill a slot with the prior, at `time`, before any measurement."""
+        """Fill a slot with the prior, at `time`, before any measurement.
+
+        A row has the filters' state, its step number (`at`), the `numbers` that came, NaN for none, and last its time.
+        """
         row = self.table[slot]
         row[:] = 0.0
         step_before_all = -1.0
@@ -108,13 +112,19 @@ class SlotTable:
         """Return (row, state and outputs) after a step of rows (state, received, inputs, step number), given in parts.
 
         The result for a single row is overwritten by the next call.
+
+        `_alone`: single rows are stepped, not those of many plants at once; `is_native`: by native code.
         """
         if len(parts[0]) == 1 and (self._alone or self.step_rows.is_native):
             return self._step_single_row(*parts)
         return self.step_rows(np.concatenate(parts, axis=1))
 
     def inputs_between(self, before: int, after: int) -> tuple[Float[np.ndarray, " inputs"], int]:
-        """Return the inputs that led from the row in one slot to that in another, and the number of the step there."""
+        """Return the inputs that led from the row in one slot to that in another, and the number of the step there.
+
+        In continuous time the inputs that held after `before` lead on, with dt the time between both rows; else
+        those that `after` holds.
+        """
         dt, table = self.program.dt, self.table
         u = table[after if dt is None else before, self.held]
         if dt is not None:
@@ -128,6 +138,7 @@ class SlotTable:
         nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
+            """Return states (row, state) after step number k without measurements, under the inputs that hold."""
             rest = np.broadcast_to(np.concatenate([nothing, held, [k]]), (len(states), len(nothing) + len(held) + 1))
             return self._step_parts(states, rest)[:, : self.step_rows.state.size].copy()
 
@@ -140,6 +151,8 @@ class SlotTable:
         """Return the rows in these slots, in order, as a smoother takes them.
 
         Copies of the last row behind them make their number a power of two, so that few lengths are compiled.
+
+        SHORTEST: the least number. A slot is the number of a row in the table.
         """
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())  # the next power of two
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]

@@ -47,7 +47,11 @@ class SenderStatus(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Return why the sender is dead, in words; "" if it is not."""
+        """Return why the sender is dead, in words; "" if it is not.
+
+        `chance`: probability that as many messages as the `missed` heartbeats are all lost; DEAD: below it they
+        are not.
+        """
         if self.missed > 0 and self.chance < DEAD:
             chance = f"by chance once in {1 / self.chance:,.0f}" if self.chance else "never by chance"
             return f"{self.missed} heartbeats did not come, {chance}"
@@ -106,6 +110,9 @@ class SilenceRule(NamedTuple):
         """Return the status where the newest value is of `last`, the newest final moment `final` and the present `now`.
 
         Before the first value the sender is silent since `begun`. All are steps where a trigger is, which begin at -1.
+
+        `provisional`: silence since the newest final moment, which a late value may still end; `silent`: that
+        before it.
         """
         since = begun if last is None else last
         silent, provisional = max(final - since, 0), max(now - max(final, since), 0)

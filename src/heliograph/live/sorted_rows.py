@@ -27,6 +27,7 @@ class HeldRow:
     __slots__ = "events", "key", "numbers", "slot"
 
     def __init__(self, key: Key, slot: int, size: int):
+        """Make a row without events, of the key (time, place of the node, count): `size` numbers NaN, and its time."""
         self.key, self.slot = key, slot
         self.numbers = [nan] * size
         self.numbers.append(key[0])
@@ -100,6 +101,7 @@ class SortedRows:
         """Return the index of the row with this key, and the row if it exists."""
         if key > self.keys[-1]:
             return len(self.keys), None
+        # Keys are sorted as the rows are, by time first.
         index = bisect_left(self.keys, key)
         exists = self.keys[index] == key
         return index, self.held[index] if exists else None
@@ -116,6 +118,7 @@ class SortedRows:
         """Write an event's values into its row; NaN is left out."""
         columns, values = self.columns_by_node[event.node_index], event.values
         if row.events:  # else nothing is there yet
+            # NaN, which is not equal to itself, leaves what is there.
             values = [there if new != new else new for there, new in zip(row.numbers[columns], values, strict=True)]
         row.numbers[columns] = values
         row.events[event.name] = event.values
@@ -151,7 +154,10 @@ class SortedRows:
         return number, [(row_after, float(count_after - count - 1) if count < count_after else nan)]
 
     def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of a node, and the event's running count; None if none has."""
+        """Return the first of these rows with an event of a node, and the event's running count; None if none has.
+
+        An event's name is (node, running count, time measured).
+        """
         for i in indices:
             for name in self.held[i].events:
                 if name[0] == node:
@@ -159,13 +165,20 @@ class SortedRows:
         return None
 
     def find_base(self, watermark: float) -> tuple[int, int]:
-        """Return the index of the row that becomes the base, and how many rows become final early, for lack of room."""
+        """Return the index of the row that becomes the base, and how many rows become final early, for lack of room.
+
+        Base: the newest row that is final, from which later ones are stepped. Watermark: time before which rows
+        become final; `capacity`: how many rows may be held after the base.
+        """
         by_time = self._find_last_before(watermark)
         base = max(by_time, len(self.held) - 1 - self.capacity)
         return base, base - by_time
 
     def move_base(self, base: int) -> tuple[list[HeldRow], list[HeldRow]]:
-        """Make the row with index `base` the base; return the rows that are final now, and those held no longer."""
+        """Make the row with index `base` the base; return the rows that are final now, and those held no longer.
+
+        The base itself is held on, as the first row.
+        """
         final, left = self.held[1 : base + 1], self.held[:base]
         del self.held[:base], self.keys[:base]
         return final, left

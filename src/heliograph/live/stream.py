@@ -96,7 +96,10 @@ class Stream:
 
     @property
     def doubt(self) -> str:
-        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else ""."""
+        """Return a sentence where the last BEYOND measurements, or more, were all unexpected; else "".
+
+        BEYOND: 10 in a row, each of a size that a right filter sees with probability RARE.
+        """
         if self._beyond < BEYOND:
             return ""
         return (
@@ -165,6 +168,8 @@ class Stream:
         """Return the estimate after the step just done, and count the components that the filter weighed by 0.
 
         `nis`: of the step's measurement, NaN where it has none; `arrived`: how many of its numbers arrived.
+
+        `weight`: of each component, 0 where the filter's gate left it out as too far off.
         """
         estimate: JudgedEstimate = self._compiled.estimate.unflatten([*self._stepper.estimate, nis, arrived])
         if len(weight := self._stepper.weight):
@@ -177,7 +182,10 @@ class Stream:
 
     @property
     def origin(self) -> Origin:
-        """Return the state after the last step, from which `hg.forecast` predicts."""
+        """Return the state after the last step, from which `hg.forecast` predicts.
+
+        `spacing`: time from one step to the next, NaN where it is an input (dt). Time counts steps from 0.
+        """
         state = self._compiled.state.unflatten([np.array(leaf) for leaf in self._stepper.state])
         time, spacing = float(self.steps - 1), float("nan") if "dt" in self.filter.inputs else 1.0
         return Origin(self.filter, state, self.steps, np.array(self._inputs), time, spacing)
@@ -189,7 +197,11 @@ class Stream:
         return np.array(found, dtype=np.int64)
 
     def _count_readings(self, screened: ScreenedReadings | None, z: np.ndarray) -> list[str]:
-        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is."""
+        """Count what was screened; where none is stuck by rule, return a line on the first run of each that is.
+
+        A filter either refuses stuck readings (`screened`), or a watch only tells of them. `refused`: counts by reason;
+        `_repeats`: runs of equal readings.
+        """
         if screened is not None:
             for reason, more in count_by_reason(screened.refused).items():
                 self.refused[reason] += more
@@ -205,7 +217,10 @@ class Stream:
         return [f"step {self.steps - 1}: {words}" for words in said]
 
     def _describe_remark(self) -> list[str]:
-        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none."""
+        """Return what the filter says of its state, such as that a gate gave in, where it is new; a line or none.
+
+        `said.times`: how often the filter has had it to say so far; `_remarked`: how often when last asked.
+        """
         said, before = self.filter.remark(self._compiled.state.unflatten(self._stepper.state)), self._remarked
         self._remarked = said.times
         return [said.words] if said.times > before else []
@@ -259,6 +274,8 @@ class Stream:
     def sender(self) -> SenderStatus:
         """Return the status of a sender that decides when to send: what its silence means by now.
 
+        `_last`: step of the newest measurement that arrived, negative before the first.
+
         Raises:
             ValueError: a filter that is none of `event_filter`.
         """
@@ -277,6 +294,7 @@ class Stream:
             "repeats": self._repeats,
             "last": self._last,
             "beyond": self._beyond,
+            # JSON has no NaN: an input that is not known is None.
             "inputs": [None if value != value else value for value in self._inputs.tolist()],
             "of": self._compiled.identity,
         }

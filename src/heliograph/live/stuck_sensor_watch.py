@@ -120,7 +120,11 @@ class RepeatWatch:
         )
 
     def _bound_repeat_probability(self, output: int, step: float) -> float:
-        """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading."""
+        """Return the largest probability, over the noises, that an output of resolution `step` repeats its reading.
+
+        `noises`: the laws that it may have; `_bounds`: results so far, KEPT_BOUNDS at most, by output and
+        resolution.
+        """
         key = output, step
         if key not in self._bounds:
             if len(self._bounds) > KEPT_BOUNDS:
@@ -145,4 +149,5 @@ class RepeatWatch:
         # (e + 1) / (o + 2) of the pairs outside the run: e = equal - (length - 1), o = readings - length.
         by_count = (equal - (length - 1) + 1) / (readings - length + 2)
         p = max(self._bound_repeat_probability(output, step), by_count)
+        # The least count c of which p^(c - 1) is below SELDOM, but LEAST at least; none if p is 1 within SURE.
         return inf if p >= 1 - SURE else max(LEAST, 1 + ceil(log(SELDOM) / log(p)))

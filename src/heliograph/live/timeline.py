@@ -230,7 +230,7 @@ class Timeline:
         return make_forecast_origin(self._fleet, *self._slot_now())
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the slot of the row at `now`, which is predicted where there is none, and its time."""
+        """Return the slot (table row) of the state at `now`, predicted where nothing came then, and its time."""
         newest, now = self._plant.rows.held[-1], self.now
         if self._program.dt is None:
             now = np.floor(min(now, self._fleet.end_step))
@@ -386,7 +386,7 @@ class Timeline:
         return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), moment, numbers, arrived)
 
     def _finalise(self) -> None:
-        """Move the base up to the watermark, and read the outputs of the rows that are final by it."""
+        """Make rows that are older than the window final, and read the outputs of those that have data."""
         results = self._fleet.finalise_plants([self._plant])
         read = [row for row in results[0].final if row.has_data()]
         if read:

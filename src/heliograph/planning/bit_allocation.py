@@ -155,6 +155,7 @@ def _information_of_bits(senders: _PlantAndSenders, bits: Sequence[int] | np.nda
 
 def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, " senders"]) -> Float[np.ndarray, "n n"]:
     """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j, X before them."""
+    # Words of no bits inform of nothing, and have no finite noise 1 / j.
     sends = j > 0
     a, q, c = senders.transition, senders.process, senders.rows[sends]
     if not sends.any():
@@ -216,6 +217,8 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
 
     By Frank and Wolfe's steps j + 2 / (k + 2) (best - j); the error is convex in j, so that the tangent at each j is
     nowhere above it, and its least value over all bits of this total is a bound.
+
+    `hulls`: the concave envelope of each sender's information over its bits, on which bits are real numbers.
     """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf

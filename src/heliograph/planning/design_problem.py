@@ -89,7 +89,11 @@ class Certificate(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Sentence on what the numbers certify."""
+        """Sentence on what the numbers certify.
+
+        `bound`: no design has less; `unit`: what is made small, the error or else the power; `stationarity`:
+        how far from zero the slope at the best point is, NaN if that is not known.
+        """
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         starts = "the one start" if self.starts == 1 else f"{self.starts} starts"
@@ -133,6 +137,8 @@ class PowerDesign(Module):
         """Design as a network that runs: every node with the filter "best", and "best" of all that they receive.
 
         Of free numbers the network that their function returns. A period is repeated for about 100 steps.
+
+        `realised`: that of free numbers, None for powers.
 
         Raises:
             ValueError: a design of independent paths, which belong to no network.

@@ -90,7 +90,11 @@ class Error(Module):
         return np.asarray(matrix)
 
     def criterion(self, states: tuple[str, ...]) -> "Criterion":
-        """Return the number that is to be small for a plant with these states, as a function of covariances."""
+        """Return the number that is to be small for a plant with these states, as a function of covariances.
+
+        `matrix`: weight of the states' covariance. If the worst direction counts the error is the largest
+        eigenvalue, which is smoothed by an exponent: SHARPER has these, the sharpest last.
+        """
         # The last step alone counts, or all alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
@@ -112,19 +116,29 @@ class Criterion(NamedTuple):
         """Return the number at covariances p (time, n, n), smoothed where it is an eigenvalue, and dnumber/dP of each.
 
         The search takes it for the error; `exact` is the error itself.
+
+        `shares`: the weight of each step in the error.
         """
         values, weights = self._differentiate_steps(p)
         return float(self.shares @ values), self.shares[:, None, None] * weights
 
     def compute_exact_error(self, p: Matrices) -> float:
-        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue."""
+        """Return the error itself at covariances p (time, n, n), without smoothing of an eigenvalue.
+
+        It is the trace of W P, or where `sharpness` is set the largest eigenvalue of W^1/2 P W^1/2; `shares`:
+        the weight of each step.
+        """
         if self.sharpness is None:
             return self.smooth(p)[0]
         root = _find_root(self.weight)
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
     def make_tangent(self, p: Matrices) -> "Criterion":
-        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere."""
+        """Return the criterion <V, P> that touches this one at p and is a lower bound of it everywhere.
+
+        A linear criterion is its own tangent. Of a largest eigenvalue V is the smoothed one's derivative,
+        scaled to trace 1 in units of the weight's root: no average of eigenvalues exceeds the largest.
+        """
         if self.sharpness is None:
             return self
         weights, root = self._differentiate_steps(p)[1], np.linalg.pinv(_find_root(self.weight))
@@ -136,7 +150,10 @@ class Criterion(NamedTuple):
         return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
-        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue."""
+        """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step; f: the trace, or the smoothed eigenvalue.
+
+        W: `weight` of each step; S = W^1/2 P W^1/2; q: `sharpness`, None for the trace.
+        """
         if self.sharpness is None:
             return np.einsum("kij,kij->k", self.weight, p), self.weight
         # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.

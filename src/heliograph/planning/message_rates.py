@@ -68,7 +68,11 @@ class _ScalarSystem(NamedTuple):
 
     @property
     def kalman_variance(self) -> float:
-        """Error variance of the sender's Kalman filter in the long run."""
+        """Error variance of the sender's Kalman filter in the long run.
+
+        Of x+ = a x + w with Var w = q, and z / c = x + v with Var v = r. The variance before a measurement is
+        the positive root of prior^2 + b prior - q r = 0.
+        """
         a, q, r = self.a, self.q, self.r / self.c**2
         b = r * (1 - a * a) - q
         prior = (-b + np.sqrt(b * b + 4 * q * r)) / 2
@@ -219,7 +223,10 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
 
 
 def _send_on_delta_rate(system: _ScalarSystem, delta: float) -> float:
-    """Return the rate of messages of send-on-delta, however small, extrapolated from two grids."""
+    """Return the rate of messages of send-on-delta, however small, extrapolated from two grids.
+
+    `system`: x+ = a x + w and z = c x + v, with the variances q of w and r of v.
+    """
     a, r, delta = system.a, system.r / system.c**2, delta / abs(system.c)  # in units of the state
     if not abs(a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {a:g}")
@@ -339,6 +346,7 @@ def _find_threshold(
     """Return the threshold delta at which `rate_at(delta)`, which falls as delta rises, is this rate."""
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
+    # The deviation by which a measured value changes in a step: a first guess of a threshold.
     unit = np.sqrt(system.q * system.c**2 + system.r)
     low = high = unit
     while rate_at(low) < rate:
@@ -370,6 +378,7 @@ def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.nd
     x, w = np.polynomial.legendre.leggauss(NODES)
     parts = []
     for a, b in pairwise(edges):
+        # In parts of few units NODES nodes suffice, as the integrand changes over a unit or more.
         cuts = np.linspace(a, b, int(np.ceil((b - a) / (8 * unit))) + 1)
         parts += list(pairwise(cuts))
     nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in parts])

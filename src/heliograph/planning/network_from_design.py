@@ -81,6 +81,7 @@ def repeat_network(network: Network) -> Network:
         """Return an OverTime repeated for COVERED steps or more, anything else as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
+        # COVERED: steps for which what is periodic is written down; the division rounds up.
         times = -(-COVERED // leaf.steps)
         return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
 

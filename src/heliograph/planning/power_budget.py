@@ -40,6 +40,7 @@ class Budget(Module):
         per_transmitter: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
         peak: "Float[ArrayLike, ''] | Mapping[str, float] | None" = None,
     ):
+        """Check the limits of the total mean power, of each transmitter's mean and of its peak; None is no limit."""
         self.total = None if total is None else float(scalar("total power", total, 0.0))
         self.per_transmitter = _read_limit("power per transmitter", per_transmitter)
         self.peak = _read_limit("peak power", peak)
@@ -136,9 +137,11 @@ class PowerLimits(NamedTuple):
         Each row is in units of its limit, so that bounds are 1, or 0 where nothing may be sent.
         """
         steps, count = self.peak.shape
+        # A row for the mean of each transmitter over the steps, then one for that of all together.
         rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
         most = np.append(self.mean, self.total)
         rows, most = rows[np.isfinite(most)], most[np.isfinite(most)]
+        # A limit of 0 cannot be divided by.
         scale = np.where(most > 0, most, 1.0)
         return rows / scale[:, None], most / scale
 
@@ -182,6 +185,7 @@ def make_power_limits(
 
 def _check_fixed_powers(what: str, power: float, limit: float) -> None:
     """Raise ValueError where transmitters that are not free send more than a limit; `what`: the limit, in words."""
+    # MET: the rounding within which a limit counts as met.
     if power > limit * (1 + MET):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")

@@ -214,7 +214,10 @@ def _list_cases(
 
 
 def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
-    """Return the likelihood filter of all that the nodes receive: linear where plant, sensors and angles allow it."""
+    """Return the likelihood filter of all that the nodes receive: linear where plant, sensors and angles allow it.
+
+    `circular`: with angles, for which no linear filter is right.
+    """
     # Of channels without memory the channel given arrival, since the filter skips what is lost (NaN). With memory, as
     # of bursts, a loss tells of the next one: the channel stays.
     plant = network.plant

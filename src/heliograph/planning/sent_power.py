@@ -61,7 +61,10 @@ class SentPower(Module):
 
     @property
     def words(self) -> str:
-        """Sentence on whether the power stays bounded."""
+        """Sentence on whether the power stays bounded.
+
+        `growth`: factor of the power from a step to the next in the long run; NaN or 1 where none is known.
+        """
         if np.isnan(self.growth) or self.growth == 1:
             return "what is sent is known for these steps only"
         if self.growth < 1:
@@ -170,7 +173,10 @@ def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: in
 
 
 def _list_sources(network: Network) -> Sources:
-    """Return sensor and channel of each node by its name, or those that all nodes share as "common"."""
+    """Return sensor and channel of each node by its name, or those that all nodes share as "common".
+
+    A relay that filters is no source.
+    """
     if network.common is not None:
         return {"common": (network.common.sensor, network.common.channel)}
     return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}
@@ -244,7 +250,10 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
 def _draw_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), a mean over each batch of drawn trajectories."""
+    """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), a mean over each batch of drawn trajectories.
+
+    BATCHES: batches of as many trajectories each, whose differences show how exact the mean is.
+    """
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
     return {name: np.asarray(y) for name, y in _average_draws(plant, sensors, jnp.asarray(inputs), keys).items()}
@@ -278,7 +287,11 @@ def _draw_output_squares(
     key_of_start, key_of_steps = jax.random.split(key)
 
     def draw_step(x: jax.Array, row: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Return the state after step k, and (y, 1)(y, 1)' of every sensor that measures it then."""
+        """Return the state after step k, and (y, 1)(y, 1)' of every sensor that measures it then.
+
+        x: the state; `row`: number of the step and inputs. `key_of_steps`: of the trajectory, from which each
+        step has keys of its own. `sensors`: by name.
+        """
         k, u = row
         key_of_noise, *keys_of_sensors = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))
         plant_k = at(plant, k)

@@ -73,6 +73,10 @@ class ScaledProgramme:
     """
 
     def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
+        """Prepare a descent from a start, in coordinates z = x / unit, with this smoothing of the error (`sharpness`).
+
+        `size`: the objective at the start, by which it is divided, so that it is about 1.
+        """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
         self._last: tuple[bytes, Evaluation | None] = (b"", None)
@@ -81,7 +85,10 @@ class ScaledProgramme:
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point z, None where it does not exist; the last one is cached."""
+        """Return the evaluation at a point z, None where it does not exist; the last one is cached.
+
+        z: the point in units of each coordinate; `sharpness`: exponent by which the error is smoothed.
+        """
         key = z.tobytes()
         if key != self._last[0]:
             self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
@@ -91,6 +98,9 @@ class ScaledProgramme:
         """Return the error, or mean total power where there is a target, over the size, and its derivative by z.
 
         Infinite where the point does not exist.
+
+        `unit`: of each coordinate, x = unit z. Powers are summed over the steps, so that their mean is that
+        over `steps`.
         """
         evaluation = self.evaluate_at(z)
         if evaluation is None:
@@ -141,6 +151,7 @@ class ScaledProgramme:
         if np.isinf(before) and not self.is_feasible(end):
             end = self._minimize(self._compute_squared_excess, end, [], tolerance)
             return self._minimize(self.objective, end, constraints, tolerance)
+        # The merit is the objective within the limits and infinite outside.
         return end if self.merit(end) < before else z
 
     def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:

@@ -43,7 +43,10 @@ DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
 def is_sum_of_links(network: object) -> bool:
-    """Return whether a network is one node that receives a sum of links."""
+    """Return whether a network is one node that receives a sum of links.
+
+    `common` is set where nodes share a channel, `relays` where relays filter.
+    """
     if not isinstance(network, Network) or network.relays is not None or network.common is not None:
         return False
     nodes = list(network.nodes.values())
@@ -79,6 +82,8 @@ class SumOfLinksTask(NamedTuple):
         """Largest amplitude of each link: a power a^2 t below peak and mean limit where it is free, else the present.
 
         The error is steady, so limits have one step.
+
+        `present`: the amplitude that a link has in the network; `unit`: t, the power at amplitude 1.
         """
         links = self.links
         caps: Vector = np.abs(links.present)
@@ -96,7 +101,10 @@ class SumOfLinksTask(NamedTuple):
         return self.error(self.covariance(self.links.information(amplitudes)))
 
     def bound_error(self, total: float) -> float:
-        """Return a lower bound of the error of all amplitudes with this total power of the free links."""
+        """Return a lower bound of the error of all amplitudes with this total power of the free links.
+
+        The error with an information that none of them exceeds; `fixed`: power of the links that are not free.
+        """
         all_links = total + self.fixed
         states = self.links.rows.shape[1]
         information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
@@ -123,7 +131,11 @@ class SumOfLinksTask(NamedTuple):
             raise fail("budget", "one that limits every transmitter", "no limit")
 
         def amplitudes_at(x: Vector) -> Vector:
-            """Return the amplitudes of all links at x, the free ones scaled down where they exceed the total."""
+            """Return the amplitudes of all links at x, the free ones scaled down where they exceed the total.
+
+            x: amplitudes of the free links as shares of `scale`, from -1 to 1; other links keep their
+            `present` ones. `unit`: power at amplitude 1.
+            """
             a = np.clip(x, -1, 1) * scale
             power = float(a**2 @ links.unit[free])
             amplitudes = links.present.copy()
@@ -265,6 +277,8 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
     """Return the total power at which the lower bound of the error reaches the target: no less power can reach it.
 
     By bisection of the power of the free links, up to the total power `needed` that was found to reach it.
+
+    `fixed`: power of the links that are not free.
     """
     low, high = 0.0, needed - task.fixed
     for _ in range(HALVINGS):
@@ -369,6 +383,7 @@ def steady_covariance_with_information(
         information: J, taken as J = H' H, a measurement H x with noise of covariance I; zero where nothing is told.
     """
     values, vectors = np.linalg.eigh(information)
+    # ALIKE: share of the largest eigenvalue below which one is rounding.
     used = values > ALIKE * max(values[-1], 0.0)
     if not used.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))

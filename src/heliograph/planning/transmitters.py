@@ -38,9 +38,11 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Return the names of the transmitters, in order of appearance."""
+    # A dict in place of a set: it keeps the order, and each name once.
     names: dict[str, None] = {}
 
     def note_name(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
+        """Note the hop's name, and leave the hop as it is."""
         names.setdefault(name)
         return hop
 
@@ -118,7 +120,12 @@ def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Sca
     powers: dict[str, Scalar] = {}
 
     def note_power(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Note what the hop sends, and leave it as it is."""
+        """Note what the hop sends, and leave it as it is.
+
+        A: `hop.matrix`; E[y y']: `signal.second` without its last row and column, those of the constant 1;
+        `arrives`: probability that the hop has a signal to send. `powers` takes the result, tr A E[y y'] A'
+        times that.
+        """
         assert signal is not None and isinstance(hop, GainAndNoise)
         if not hop.is_silent:
             powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
@@ -131,6 +138,7 @@ def _list_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Sca
 def _divide_by_probability(total: Scalar, probability: Scalar) -> Scalar:
     """Return total / probability, a conditional mean; zero where the condition never holds."""
     if is_traced(probability):
+        # Under JAX both branches are computed: no division by 0 may occur.
         quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)
         return quotient
     return 0.0 if is_zero(probability) else plain(total / probability)
@@ -160,7 +168,11 @@ def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float 
     """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
 
     def amplify(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Return the hop of this name amplified, any other as it is."""
+        """Return the hop of this name amplified, any other as it is.
+
+        `name`: of the hop that is changed; `factor`: None in place of a number sets its matrix to 1, so that it
+        sends just what it receives.
+        """
         if hop_name != name:
             return hop
         matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor

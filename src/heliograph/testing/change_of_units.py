@@ -206,7 +206,10 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, out: np.ndarray, into: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one."""
+    """Return the matrix with elements out_i A_ij / into_j, a function of the inputs if A is one.
+
+    `inputs`: factors of the inputs, by which they are divided before the function of them is called.
+    """
     factor = out[:, None] / into
     if isinstance(matrix, MatrixOfInputs):
         return FunctionInUnits(matrix.function, factor, (inputs,))
@@ -220,7 +223,10 @@ def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
 
 
 def _rescale_sensor(sensor: AbstractSensor, units: Units) -> AbstractSensor:
-    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R."""
+    """Return the sensor whose states and outputs are counted in other units: R h(S^-1 x), R V R.
+
+    S and R are diagonal, of the factors of states and outputs in `units`; V: covariance of the noise.
+    """
     s, r = units.states, units.outputs
     if isinstance(sensor, LinearSensor):
         return LinearSensor(
@@ -241,6 +247,8 @@ def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
 
     It is z = Q G R^-1 y + Q n then; R and Q are diagonal, of the factors in `units`.
+
+    `factor`: of the second moment of each pair of entries of (G, n), the product of the two entries' factors.
     """
     q, (_, factor) = units.received, _list_channel_factors(units)
 
@@ -271,7 +279,10 @@ def _rescale_by_mode(channel: Modes | OverTime, units: Units) -> Modes | OverTim
 
 
 def _rescale_combinations(components: AtomCombinations | OverTime, units: Units) -> AtomCombinations | OverTime:
-    """Return the combinations of a filter's atoms with state and measurements in other units."""
+    """Return the combinations of a filter's atoms with state and measurements in other units.
+
+    A combination: one value of each discrete gain, with its probability `weight` and the channel that it makes.
+    """
     values = stack_over_time(components)
     q = units.received
     scaled = AtomCombinations(
@@ -286,7 +297,11 @@ def _rescale_combinations(components: AtomCombinations | OverTime, units: Units)
 
 
 def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> UnconditionalMean | None:
-    """Return the mean before data with state and measurements in other units."""
+    """Return the mean before data with state and measurements in other units.
+
+    With x in units S and z in units Q: the start is S E[x_0], the transition S A S^-1, the drift S b, and the
+    matrix with which the mean is received Q M S^-1.
+    """
     if centre is None:
         return None
     s = units.states

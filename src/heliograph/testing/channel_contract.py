@@ -73,6 +73,7 @@ def _compare_draw_pairs(modes: JointModes, now: np.ndarray, later: np.ndarray) -
     Returns:
         The largest difference between samples and moments, in standard errors.
     """
+    # Without the last row of each mean, that of the constant 1.
     means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
     expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
     seen = np.einsum("sab,scd->sabcd", now, later)
@@ -120,6 +121,8 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
         """Return the state at the start, then state and draw after one draw and after a second, then `sample`'s draw.
 
         `sample` draws by the key of the first draw; () of a map that remembers, which has no such function.
+
+        `channel`: the map that is tested; `words`: the data of a random key.
         """
         # A draw may split its key: keys of one split are no parts of each other, as fold_in(key, 1) is of split(key).
         at_start, at_first, at_second = jax.random.split(jax.random.wrap_key_data(words), 3)

@@ -169,6 +169,7 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
     value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
     assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
     assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
+    # Silence tells something where a sender decides when to send.
     if np.all(missing) and filter.silence_tells:
         assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood of silence, got {likelihood:g}"
     elif np.all(missing):
@@ -180,7 +181,10 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, filter: AbstractFil
 
 
 def _check_same(what: str, estimate: Estimate, expected: Estimate) -> None:
-    """Raise AssertionError unless estimates are equal to rounding."""
+    """Raise AssertionError unless estimates are equal to rounding.
+
+    ROUNDING: the relative difference that is allowed. `what`: the operation, for the error's words.
+    """
     for name in ("mean", "covariance"):
         a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))
         same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)

@@ -68,7 +68,7 @@ def _find_worst_excess(
 
     The fused error is sum_i W_i e_i, the covariance of e_i is at most P_i, and E is that of the fused error. The worst
     is sup v' E v = (sum_i |P_i^(1/2) W_i' v|)^2, where all errors move together. Its root is convex in v, so that
-    v <- B^+ grad, with the gradient of the root, ascends the ratio to v' B v at each step.
+    v <- B^+ grad, with the gradient of the root, ascends the ratio to v' B v at each step; ASCENTS steps, STARTS times.
 
     Args:
         gains: W_1, W_2, ... side by side (n, count n).

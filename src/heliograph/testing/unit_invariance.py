@@ -171,6 +171,7 @@ def _count_possible_rows(network: Network, node: str, name: str, z: dict[str, np
     else:
         runs = [(network.nodes[n].filters[fusion.filter], z[n]) for n in network.nodes_with(fusion.filter)]
     impossible = [np.isneginf(filter.run(rows, u).log_likelihoods) for filter, rows in runs]
+    # The index of the first impossible row; a True behind all rows stands for none.
     return int(np.argmax(np.append(np.any(impossible, axis=0), True)))
 
 
@@ -210,6 +211,7 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
     for affine in maps:
         turned = Series([known(np.diag(1 / units.outputs)), affine, known(np.diag(units.received))])
         off = _measure_difference(rescale_channel(second_order(affine), units), second_order(turned))
+        # DIGITS: the largest relative difference that is allowed.
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
     filters = {f: rescale_filter(filter, units) for f, filter in node.filters.items()}
     return Node(rescale_sensor(node.sensor, units), _change_units_of_channel(node.channel, units), filters)

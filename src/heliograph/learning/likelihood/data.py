@@ -181,6 +181,8 @@ def _check_enough_data(data: LikelihoodData, free: int) -> None:
     """Raise ValueError if the data have fewer than FEWEST numbers for each of `free` ones, or nothing in them varies.
 
     What counts are the true states where these are learned from, else the measurements that arrived.
+
+    FEWEST: 10 numbers for each free one.
     """
     counted = data.measurements if data.truth is None else data.truth
     count = int(np.count_nonzero(~np.isnan(counted)))

@@ -108,7 +108,11 @@ def _sum_rows(rows: Evaluation) -> Evaluation:
 
 
 def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: LikelihoodData) -> Evaluation:
-    """Return the evaluation of all recordings, row by row, at all points x (points, p): each pair side by side."""
+    """Return the evaluation of all recordings, row by row, at all points x (points, p): each pair side by side.
+
+    By our own compiled code where `choose_code` finds some for these arguments, else by XLA, pair by pair.
+    `halves`: information of the first and of the second half of the rows, summed over recordings.
+    """
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     # Each point with each recording: points in the outer loop, recordings in the inner one.
     count, copies = len(data.measurements), (len(x), 1, 1)
@@ -150,7 +154,11 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
     e, s, de, ds = _differentiate_errors(objective, x, z, u, truth)
 
     def add_row(halves: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the halves' information with that of a row added, and the row's log density and score."""
+        """Return the halves' information with that of a row added, and the row's log density and score.
+
+        `half`: the row with which the second half begins. `row`: its number k, error e with covariance s and
+        their derivatives, and what is compared with the prediction: the measurement, or the true state.
+        """
         k, e, s, de, ds, compared = row
         # e is the difference of `compared` and its prediction; z may end in the modes of a channel, not predicted.
         compared = compared[: len(e)]

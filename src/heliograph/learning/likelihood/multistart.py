@@ -112,6 +112,7 @@ class MaximumSearch:
         top = _take_best_climb(climbed, no_ends)
         for _ in range(ROUNDS):
             top = self._move_to_limits(top)
+            # `again`: points from which to climb on; None where there are none.
             again, reason = self._choose_restarts(top) if top.converged else (None, top.reason)
             if again is None:
                 reason = self._explain_unbounded(top) or reason
@@ -123,6 +124,9 @@ class MaximumSearch:
         """Return `count` points drawn around a maximum, and one more near each end of a domain.
 
         Logarithms and logits are within SPREAD of it, real numbers some standard errors away.
+
+        AWAY: how many; LOWERED: how far towards an end, as steps of a logarithm or logit; INWARDS: distances
+        from an end that are tried; SEEN: nats by which the likelihood has fallen where a number matters.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
@@ -172,6 +176,7 @@ class MaximumSearch:
         """
 
         def keep_best(now: ClimbEnds) -> None:
+            """Keep the best point so far in `self.best`, as not converged, and pass the climbs on to `self.watch`."""
             top = _take_best_climb(now, ends)
             if self.best is None or not top.total < self.best.total:
                 self.best = top._replace(converged=False, reason="")
@@ -206,6 +211,9 @@ class MaximumSearch:
 
         A maximum has neither points nor a reason. Of each number at the end of its domain the likelihood is looked at
         on the way back inside. At a saddle climbs begin to both sides of it.
+
+        SAME: nats that are no rise; SADDLE: a curvature, below 0, under which the point is a saddle; NEAR: gain
+        of a step by the Hessian that counts as none.
         """
         for index in np.flatnonzero(top.ends):
             points, rise = self._evaluate_inwards_of_end(top, int(index))
@@ -223,6 +231,8 @@ class MaximumSearch:
 
         A climb may end there all the same, where rounding is what is left. The log-likelihood for each number is about
         -log of the size of its innovation.
+
+        EXACTLY: logarithm of the data's size over that of the innovations beyond which these are rounding.
         """
         z = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         size = np.log(np.nanmax(np.abs(z)))
@@ -234,6 +244,9 @@ class MaximumSearch:
         """Return points from the end of a number's domain inwards (INWARDS, p), and how much higher l is there.
 
         `index`: coordinate of the number; `top`: the point at the end.
+
+        INWARDS: distances from the end, 0 to 40 steps of a logarithm or logit. l: log-likelihood, here -inf
+        where it is NaN.
         """
         points = np.repeat(top.x[None], len(INWARDS), axis=0)
         points[:, index] -= top.ends[index] * INWARDS
@@ -244,6 +257,8 @@ def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
     """Return the best of the climbs, with why it stopped if it did not converge.
 
     `ends`: -1 or 1 where a coordinate was held at an end of its domain, else 0 (p,).
+
+    `climbed.order`: climbs from the highest down; `remaining`: nats that a further step still promises.
     """
     lane = int(climbed.order[0])
     converged, remaining = bool(climbed.converged[lane]), float(climbed.remaining[lane])

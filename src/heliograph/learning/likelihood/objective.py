@@ -34,6 +34,7 @@ def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """
     if network.relays is not None:
         raise fail("network to be learned", "nodes that receive sensors through channels", "relays that filter")
+    # Nodes that receive one channel together.
     if network.common is not None:
         return network.plant, network.common.sensor, _condition_on_arrivals(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
@@ -104,7 +105,11 @@ class Objective:
         filter = self.filter(x)
 
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return a row's innovation and its covariance, NaN after which the filter has no estimate."""
+            """Return a row's innovation and its covariance, NaN after which the filter has no estimate.
+
+            `filter`: at the values of the free numbers. A lost estimate, NaN, makes the likelihood NaN, and not that of
+            a row where nothing arrived.
+            """
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
             value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
             return jnp.where(is_lost, 0.0, value), jnp.where(is_lost, jnp.nan, covariance)
@@ -160,7 +165,11 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
 
 
 def list_forms(network: Network) -> list[Form]:
-    """Return the forms of the likelihood that a network allows, "linear" before "conditional"."""
+    """Return the forms of the likelihood that a network allows, "linear" before "conditional".
+
+    `circular`: with angles; `past`: packets come late; `remembers`: a channel with memory. Linear: by the unconditional
+    moments of the state; conditional: by those given the data.
+    """
     plant, sensor, channel = join_all_nodes(network)
     link = first(channel)
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:

@@ -109,7 +109,9 @@ def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
     """Return how many coordinates on the line a number of this domain and shape has."""
     count = int(np.prod(shape))
     if domain.kind == "simplex":
+        # The probabilities of each distribution (last axis) sum to 1: one of them is not free.
         return count - count // shape[-1]
+    # Of a covariance: the entries on and below the diagonal.
     return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
 
 

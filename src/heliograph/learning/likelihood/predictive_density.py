@@ -51,6 +51,7 @@ def discretise_laws(channel: Map, count: int) -> Map:
         return isinstance(leaf, AbstractLaw)
 
     def discretise(leaf: object) -> object:
+        """Return `count` values with probabilities in place of a random law; anything else as it is."""
         return (
             approximate_law_by_nodes(leaf, count) if isinstance(leaf, AbstractLaw) and leaf.constant is None else leaf
         )
@@ -61,7 +62,11 @@ def discretise_laws(channel: Map, count: int) -> Map:
 
 @cache
 def _make_normal_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Phi(t), the normal distribution function, at `count` nodes t of equal distance, and their weights."""
+    """Return Phi(t), the normal distribution function, at `count` nodes t of equal distance, and their weights.
+
+    REACH: the last node, in standard deviations. The weights are the normal density at the nodes, scaled to sum to
+    1.
+    """
     t = np.linspace(-REACH, REACH, count)
     weights = np.exp(-(t**2) / 2)
     return np.asarray(ndtr(t)), weights / weights.sum()
@@ -179,7 +184,11 @@ class ChannelDensities(tuple[StackPartDensity, ...]):
 
 
 def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
-    """Return the combinations of gains and noises with a probability above zero as arrays, one axis over them."""
+    """Return the components of one part of a channel as arrays, one axis over them.
+
+    A component is one combination of values of its gains and noises, with the weight of its probability; those of
+    probability zero are left out.
+    """
     possible = [component for component in components if component.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
     return StackPartDensity(log_weight=np.log(weight), gain=gain, offset=offset, noise=noise)
@@ -193,6 +202,7 @@ def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], par
         parts: the combinations of gains of each part of the channel.
     """
     y, spread, z = expected
+    # ROWS steps at a time, so that memory stays bounded; one empty block where there are no steps.
     blocks = [
         _score_stack_parts(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
         for i in range(0, max(len(z), 1), ROWS)

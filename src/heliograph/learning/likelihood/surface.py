@@ -55,7 +55,10 @@ class LikelihoodSurface:
         return OpenEnds(low=low, high=high, single=single & (low | high))
 
     def of_first_rows(self) -> "LikelihoodSurface | None":
-        """Return the likelihood of the first rows of long recordings alone; None where they are not long."""
+        """Return the likelihood of the first rows of long recordings alone; None where they are not long.
+
+        LONG: rows from which on a recording is long; FIRST: rows of it that are kept.
+        """
         data = self.data
         if data.measurements.shape[1] < LONG:
             return None
@@ -76,6 +79,7 @@ class LikelihoodSurface:
     def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return the evaluation at points with densities and scores by row, which are not cached of long recordings."""
         whole = self.evaluations(x)
+        # What is kept has every row, unless recordings are long.
         if whole.density.shape[2] == self.data.measurements.shape[1]:
             return whole
         return evaluate_at_points(self.objective, np.asarray(x), self.data, by_row=True)
@@ -112,9 +116,10 @@ class LikelihoodSurface:
     def information_by_row(self, x: Float[np.ndarray, " p"], places: np.ndarray) -> list[Float[np.ndarray, "steps k"]]:
         """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
-        By central differences at the point x (p,); `places`: indices of the coordinates.
+        By central differences at the point x (p,), over DIFFERENCE standard errors; `places`: indices of coordinates.
         """
         deviation = self.standard_errors(x)[places]
+        # A number without a finite standard error is not moved, and has information 0.
         width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(places), len(x)))
         shifts[np.arange(len(places)), places] = width

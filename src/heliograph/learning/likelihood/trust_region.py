@@ -104,7 +104,7 @@ class _Lanes(NamedTuple):
     joined: np.ndarray
 
     def ends(self, steps: int) -> ClimbEnds:
-        """Return where the lanes are after so many steps; one that has joined another is where that one is."""
+        """Return where the lanes (searches side by side) are after so many steps; one that joined another is there."""
         lane = self.joined
         for _ in range(len(lane)):  # a lane may join one that joins a third
             lane = lane[lane]

@@ -72,7 +72,11 @@ def trust_region_step(
 
 
 def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return U B U (lanes, p, p) of each model B, U = diag(unit); of the information where B is huge or not finite."""
+    """Return U B U (lanes, p, p) of each model B, U = diag(unit); of the information where B is huge or not finite.
+
+    `unit`: standard errors (lanes, p), a lane being one of several searches side by side. LARGEST: curvature in
+    these units beyond which a model is but rounding.
+    """
     scaled = _scale_both_sides(model, unit)
     sane = np.all(np.abs(scaled) < LARGEST, axis=(1, 2))  # neither huge nor NaN
     return np.where(sane[:, None, None], scaled, _scale_both_sides(information, unit))
@@ -103,6 +107,8 @@ def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.nd
     """Return (B + s D^2)^-1 r of each lane (lanes, p); 0 along directions in which the matrix is singular.
 
     `b`: B (lanes, p, p); `shift`: s (lanes,); `d`: the diagonal of D (lanes, p); `right`: r (lanes, p).
+
+    A lane is one of several searches side by side. ROUNDING: share of the largest eigenvalue below which one is 0.
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
@@ -117,6 +123,8 @@ def expected_gain(
     """Return g' I^-1 g (lanes,), twice what a full step gains, by gradient g (lanes, p) and information (lanes, p, p).
 
     Only coordinates that are `counting` (lanes, p), and directions that are identified, add to it.
+
+    FLAT: eigenvalue, in units of standard errors, up to which a direction is not identified.
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
@@ -132,6 +140,7 @@ def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray)
     errors; the other columns are zeros.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
+    # LEAST: information so small that its square would underflow.
     informed = moving & (diagonal > LEAST) & np.isfinite(diagonal)
     unit = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1.0)), 0.0)
     scaled = _scale_both_sides(information, unit)

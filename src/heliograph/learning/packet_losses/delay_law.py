@@ -41,7 +41,11 @@ class Delays:
         )
 
     def __str__(self) -> str:
-        """One line: each delay in seconds with its probability and interval."""
+        """One line: each delay in seconds with its probability and interval.
+
+        `shares`: probability of each delay in steps; `step`: seconds of a step; `early`: measurements logged before
+        their time, which are not counted.
+        """
         shares = [f"{steps * self.step:g} s {s.estimate:.3g} ({s.low:.2g} to {s.high:.2g})"
                   for steps, s in self.shares.items()]  # fmt: skip
         early = f"; {self.early} more were logged before they were measured" if self.early else ""

@@ -49,6 +49,7 @@ class HiddenModeLosses(AbstractLossLaw):
         whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return log P(fates) - log P(ends arrive) at logits x, and its gradient; `ends`: None if none are."""
             value, gradient = whole.likelihood(x)
             if ends is None:
                 return value, gradient
@@ -101,7 +102,11 @@ class FateRuns:
     """
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
-        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has."""
+        """Keep by kind which runs are of it, their distinct lengths, and which of these each run has.
+
+        A run: packets in a row of one kind, the fate that they share, or one START. `length`: its number of
+        packets.
+        """
         self.kind = kind
         masks = {int(fate): kind == fate for fate in np.unique(kind)}
         self.runs_by_kind = {
@@ -111,6 +116,7 @@ class FateRuns:
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
         """Return the runs of stretches of fates (packets,), one after another, each behind a START."""
+        # Fates as whole numbers: 0 arrived, 1 lost, and UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
         return FateRuns(code[first], np.diff(np.append(first, len(code))))
@@ -118,7 +124,7 @@ class FateRuns:
     def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-likelihood l at logits x of (loss when good, when bad, fail, recover), and its gradient (4,).
 
-        By complex steps: the imaginary part of l(x + i h) is h dl/dx.
+        By complex steps: the imaginary part of l(x + i h) is h dl/dx, its square being nothing (h = STEP).
         """
         # Rows 0 to 3 have a step in one logit each, row 4 none.
         shifted = np.broadcast_to(x, (5, 4)).astype(complex)

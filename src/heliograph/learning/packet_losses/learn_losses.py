@@ -165,6 +165,7 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
     for name, law in laws.items():
+        # Independent losses have one number: a law has as many more degrees of freedom as further numbers.
         ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
         if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
             significant.add(name)
@@ -183,7 +184,11 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 
 
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
-    """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for."""
+    """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for.
+
+    Of the Markov laws one looks back over one packet, the other over LONG; HIDDEN has a good and a bad mode that are
+    not seen; RUNNING follows the share of losses as it drifts.
+    """
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
@@ -200,6 +205,7 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
     """
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
+    # Later fates are hidden as unknown, so that the laws are fitted to the first `cut` alone.
     early = np.where(late, np.nan, everything)
     ends = np.cumsum([len(stretch) for stretch in parts])[:-1]
     laws = _fit_laws(CheckedFates(np.split(early, ends)), intervals=False)
@@ -273,6 +279,7 @@ class RunningRateLosses(AbstractLossLaw):
         known = ~np.isnan(fate)
         base, weight, step = (share.estimate for share in self.shares().values())
         at_known, _ = _predict_losses(np.append(fate[known], 0.0), base, weight, step)  # also after the last known one
+        # Each packet, known or not, is predicted from the known fates before it, which are so many.
         return np.asarray(at_known[np.cumsum(known) - known])
 
 

@@ -48,7 +48,8 @@ class AbstractLossLaw(Module):
     def log_likelihoods(self, fates: object) -> Packets:
         """Return log P(fate | those before) of each packet of all stretches; NaN where the fate is unknown.
 
-        A last packet that is an end because it arrived has log P(arrived | those before) - log P(arrived | the first).
+        A stretch may have been cut to end with an arrival: its last packet has log P(arrived | those before) - log
+        P(arrived | the first).
 
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
@@ -61,6 +62,8 @@ class AbstractLossLaw(Module):
 
         Of a stretch that was chosen for its ends the last one has log P(arrived | those before) - log P(arrived | the
         first), so that the sum is the log-likelihood given both ends.
+
+        CHOSEN: the fate of a packet that arrived, and is an end of its stretch for that reason.
         """
         p = self.predicted(fill_ends(fate))
         with np.errstate(divide="ignore"):
@@ -127,9 +130,10 @@ class MarkovLosses(AbstractLossLaw):
     def fit(fates: object, order: int = 1, intervals: bool = True) -> "MarkovLosses":
         """Return the law by counts over packets of which the last `order` fates are known.
 
-        Between ends that arrived for being ends the chain is one given its end. For order 1 the counts are then such
-        that their shares are the maximum of that likelihood, with as many packets as know as much, and intervals are
-        by its profile; for higher orders packets between the ends are counted.
+        A stretch may have been cut so that it begins and ends with an arrival: what follows then is taken given that
+        its end arrives. For order 1 the counts have the shares that make this likelihood largest, and are of as many
+        packets as tell so much; intervals are by its profile. For higher orders only packets between the ends are
+        counted.
 
         Raises:
             ValueError: what is no fates, or an order that is not from 1 to 12.
@@ -157,6 +161,9 @@ class MarkovLosses(AbstractLossLaw):
 
         Of a higher order P(lost | past) of each past. Between ends that were chosen for arriving the intervals are the
         likelihood's.
+
+        `given_ends`: both shares, where stretches were cut so that they end with an arrival; else None. `counts`:
+        (arrived, lost) after each past.
         """
         if self.given_ends is not None:
             return dict(zip(("fail", "recover"), self.given_ends, strict=True))
@@ -193,7 +200,10 @@ class MarkovLosses(AbstractLossLaw):
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds."""
+        """Return the link in modes that are the last fates; after a past that was never seen a loss has even odds.
+
+        A lost packet is an `erasure` that nothing passes. `counts`: (arrived, lost) after each past.
+        """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
             shares = self.shares()
@@ -259,6 +269,9 @@ class _LikelihoodBetweenEnds(NamedTuple):
 
         a: P(lost | arrived before), b: P(arrived | lost before). P_m = (b + a (1 - a - b)^m) / (a + b): the probability
         to arrive again after m steps. It is divided by since arriving at the end is why the stretch ends there.
+
+        n: `counts` of arrivals and losses after either fate, p: the probability of each; m: `spans`, the steps from the
+        first to the last packet of each stretch that was cut at arrivals.
         """
         a, b = shares = 1 / (1 + np.exp(-x))
         # P_m = again / total, with power = (1 - a - b)^m, whose derivative in a, and in b, is `slope`.

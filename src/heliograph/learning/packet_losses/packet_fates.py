@@ -127,7 +127,7 @@ def _split_rising(received: np.ndarray) -> list[list[int]]:
 def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
     """Return whether numbers that came again, at the begin of a rising run, are copies, and not of a restarted sender.
 
-    A few are, if all of them came within the last COPY. More are where all that came from a number on comes again, and
+    A few (FEW) are, if all came within the last COPY. More are where all that came from a number on comes again, and
     the run goes on from there, as from a broker that was not told of their arrival; but not from the first number on.
     After 5, 6, 7, 8 come 7, 8, 9: `stretch` [5, 6, 7, 8] came before, `run` [7, 8, 9] rises from the break on, and
     `again` [7, 8] are those of it that had come.

@@ -32,6 +32,7 @@ def maximise_over_shares(
         value, gradient = function(x)
         return -value, -gradient
 
+    # Logits beyond END are shares of 0 and 1, as far as data tell.
     bounds = [(-END, END)] * len(starts[0])
     results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
     best = min(results, key=lambda end: float(end.fun))
@@ -43,6 +44,8 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 
     Each has the interval at whose ends its profile has fallen by FALL, or NaN in place of it unless `intervals`. A
     share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
+
+    Profile: the log-likelihood with this share held, maximised over the others. FALL: 1.92, for intervals of 95 %.
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
@@ -52,7 +55,8 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
     """Return share i at the maximum `top` (logits), with the interval at whose ends its profile has fallen by FALL.
 
-    `value`: the log-likelihood at the maximum.
+    `value`: the log-likelihood at the maximum. Of a share at 0 or 1 one side of the interval is open, and its fall
+    is FALL_AT_END. END: the largest logit of the search.
     """
     # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
@@ -83,7 +87,12 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
     def height_above_level(logit_of_share: float) -> float:
-        """Return how far the profile at this logit is above the level."""
+        """Return how far the profile at this logit is above the level.
+
+        `function`: log-likelihood of all logits. i: the logit that is held; `others`: the rest, over which it
+        is maximised; `nearby`: their values at the last height above the level, from which the next search
+        begins.
+        """
         nonlocal nearby
         best_others, profile = maximise_over_shares(
             _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
@@ -108,6 +117,7 @@ def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray
     """Return the log-likelihood as a function of the `others` alone (indices of logits), where logit i is `fixed`."""
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log-likelihood with logit i held, and its gradient by the others, `free` being their values."""
         x = np.zeros(len(free) + 1)
         x[i], x[others] = fixed, free
         value, gradient = function(x)

@@ -315,11 +315,11 @@ class PlantMigration:
     def _translate_numbers(self, numbers_before: np.ndarray, index_here: Mapping[int, int]) -> np.ndarray:
         """Return (row, measurements by node, inputs, time) in this network's order, NaN of nodes that were not there.
 
-        `numbers_before`: the same of the other network. `index_here`: index of a node here by that there.
+        `numbers_before`: those of the other network (`_old`). `index_here`: a node's index here by that there.
         """
         given, received, network = self._old["given"], self.fleet.program.received, self.fleet.network
         numbers = np.full((len(numbers_before), received + given + 1), np.nan)
-        # Inputs and time come last in both.
+        # Inputs (`given` columns) and time come last in both, behind the measurements (`received` columns here).
         numbers[:, received:] = numbers_before[:, numbers_before.shape[1] - given - 1 :]
         # The first column of each node, and the end of the last one's: node `there` has as many as it has `here`.
         starts_before = np.cumsum([0, *self._old["nodes"].values()])

@@ -32,6 +32,9 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
     That is so if each part of `new` was there with its shape, or is a factor of a covariance that was there.
+
+    A part is known by its path, such as ".covariance" behind a stem; its factors are the parts LOWER (L below the
+    diagonal) and VARIANCES (D), of n (n - 1) / 2 and n numbers.
     """
     shapes, places = {path: list(shape) for path, shape in old.items()}, _trace_paths(old, new)
     for stem in _find_factored(old, places.values()):
@@ -41,7 +44,10 @@ def can_read_layout(old: Shapes, new: Shapes) -> bool:
 
 
 def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states."""
+    """Return the parts of a state that fits, under the paths `new`; shapes may have leading axes for several states.
+
+    A covariance of which only the factors are wanted, LOWER (L below the diagonal) and VARIANCES (D), is factorised.
+    """
     results, places = dict(parts), _trace_paths(parts, new)
     for stem in _find_factored(parts, places.values()):
         results[stem + LOWER], results[stem + VARIANCES] = factorise_covariance(results.pop(stem + COVARIANCE))
@@ -49,7 +55,10 @@ def relocate_parts(parts: Mapping[str, np.ndarray], new: Iterable[str]) -> dict[
 
 
 def describe_old_layout(new: Shapes) -> dict[str, list[int]]:
-    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order."""
+    """Return the layout that a state of the layout `new` had until version 0.3.0, in its order.
+
+    Until then a covariance P stood where its factors stand now, L below the diagonal (LOWER) and D (VARIANCES).
+    """
     results: dict[str, list[int]] = {}
     for path, shape in new.items():
         place = _flatten_path(path)
@@ -110,10 +119,12 @@ def place_flags(filters: Columns) -> dict[str, dict[str, list[Any]]]:
 
 
 def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFlag | None:
-    """Add the columns of a filter's parts to those taken, up to its first flag, which is returned; None without one.
+    """Add the columns of a filter's parts to `taken`, up to the first flag; return that flag, or None without one.
 
-    A flag's columns begin before the end of the part before it, or, of a flag that comes first, are taken already.
-    What comes after the flag is taken too where it lies behind the part before it.
+    A flag is a boolean part. Old versions wrote its value, 0 or 1, where the number of its first column belongs, so
+    that its columns are not known ("lost"). It is found by that number: no part begins before the end of the part
+    before it, or, as the first, at a column that is taken. Parts after the flag that begin behind the part before
+    it have true columns, and are taken as well.
 
     Args:
         parts: of one filter, in their order.
@@ -122,7 +133,7 @@ def _take_columns(parts: list[_StatePart], end: int, taken: set[int]) -> _LostFl
     """
     for i, part in enumerate(parts):
         if part.columns and (part.first < end or (not end and part.first in taken)):
-            # A flag that comes first is of the memory of fusions, which stands behind all filters.
+            # A flag that comes first is of the memory of fusions, which stands behind all filters: so does its end.
             end = end or sys.maxsize
             after = parts[i + 1 :]
             for later in after:
@@ -166,7 +177,10 @@ def _flatten_path(path: str) -> str:
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:
-    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead."""
+    """Return the paths, without '.covariance', of covariances in `old` of which `new` has the factors instead.
+
+    LOWER and VARIANCES end the paths of its factors, L below the diagonal and D.
+    """
     before, now = set(old), set(new)
     stems = [path.removesuffix(COVARIANCE) for path in old if path.endswith(COVARIANCE) and path not in now]
     return [stem for stem in stems if {stem + LOWER, stem + VARIANCES} <= now - before]

@@ -46,7 +46,11 @@ class PlantParts(NamedTuple):
 
     @staticmethod
     def from_bytes(data: bytes, width: int) -> "PlantParts":
-        """Read the parts from bytes, of rows with `width` numbers; raise ValueError if these have another width."""
+        """Read the parts from bytes, of rows with `width` numbers; raise ValueError if these have another width.
+
+        HEAD: the lengths; TYPES: type of the numbers of each array; TABLE: index of the table among these, of
+        which only the numbers that are not zero are stored if the head says how many (KEPT).
+        """
         length, rows, events, numbers = HEAD.unpack_from(data)
         head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
@@ -87,7 +91,11 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
 
 
 def _pack_parts(head: dict[str, Any], *flat: Sequence[float] | np.ndarray) -> bytes:
-    """Return as bytes the lengths of all parts, the head, and the flat parts (keys, events, table, times, values)."""
+    """Return as bytes the lengths of all parts, the head, and the flat parts (keys, events, table, times, values).
+
+    HEAD: the lengths; TYPES: type of the numbers of each flat part; TABLE: index of the table among these; KEPT:
+    entry of the head that says how many of its numbers are stored.
+    """
     keys, events, _, _, values = flat  # of shapes (rows, 2), (events, 3) and (numbers,) once they are unpacked
     counts = len(keys) // 2, len(events) // 3, len(values)
     arrays = [np.array(a, dtype=kind) for a, kind in zip(flat, TYPES, strict=True)]

@@ -70,7 +70,10 @@ HEAD = "head"
 
 
 def pack_snapshot(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return a head and arrays as bytes."""
+    """Return a head and arrays as bytes.
+
+    The head is JSON, under the name HEAD among the arrays of an NPZ file.
+    """
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)
     np.savez(file, allow_pickle=False, **{HEAD: written, **arrays})

@@ -83,6 +83,7 @@ def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
+    # All hops may change their powers, and none sends a fixed one.
     limits = make_power_limits(make_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
@@ -93,6 +94,9 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
     """Return the finite limits of a budget, peaks too, as rows of all powers, and the target error (None without one).
 
     Powers are no free numbers here, so that their peaks are limits like others.
+
+    Each row times all powers, step by step, is at most its number in `most`; a row of a peak is one power over its
+    peak, so that its number is 1.
     """
     rows, most = allowed.make_limit_rows()
     peak = allowed.peak.ravel()

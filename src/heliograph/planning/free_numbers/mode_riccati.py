@@ -59,6 +59,9 @@ class ModeSolution(NamedTuple):
 def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     """Return the covariances X with the best gains K, and their adjoint L under the criterion, by step and mode.
 
+    `m.start` None: the periodic steady state is solved for, else the recursion is run from that covariance. A
+    covariance may be negative by the share NEAR of the largest entry, as it is computed to so many digits.
+
     Raises:
         ValueError: an error that grows without limit.
     """
@@ -111,7 +114,10 @@ def _run_riccati(m: ModeSystem, parts: Float[np.ndarray, "_ n n"]) -> tuple[Part
 
 
 def _update_riccati(m: ModeSystem, k: int, parts: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best gain K (modes, n, m) of step k and the covariances X (modes, n, n) after it, by X before."""
+    """Return the best gain K (modes, n, m) of step k and the covariances X (modes, n, n) after it, by X before.
+
+    X of a mode is its covariance times its probability, `law`: the noises are weighted alike.
+    """
     law = m.law[k][:, None, None]
     prior = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(parts)
     # A mode that never occurs has X = 0, so with any regular noise its gain is zero.
@@ -131,7 +137,11 @@ def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
 
 
 def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error."""
+    """Return sum_k,j <L_k,j, right side of X_k,j>, whose gradient in m at fixed X, K and L is that of the error.
+
+    X_k,j: covariance after step k in mode j, weighted by the mode's probability; its right side: what the recursion
+    under the gains K makes of those before it; L: adjoint, what the error gains by each X.
+    """
     parts, gains, adjoint = (jnp.asarray(values) for values in solution)
     earlier = jnp.roll(parts, 1, axis=0)
     if m.start is not None:  # the first step's chain forgets the mode before: any will do

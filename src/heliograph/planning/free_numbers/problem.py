@@ -85,7 +85,10 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first."""
+        """Return another start, a vector: anywhere between the ends, or without ends by a factor about the first.
+
+        `low`, `high`: ends of each number's range, infinite where there is none.
+        """
         between = np.isfinite(self.low) & np.isfinite(self.high)
         within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
         factor = np.exp(draws.normal(size=len(self.low)))
@@ -182,6 +185,7 @@ class TracedNetwork:
     start: Network
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the other leads to the same programs, by builder, network and shapes of arrays."""
         return isinstance(other, TracedNetwork) and are_same(
             (self.build, self.start, self._list_array_shapes()), (other.build, other.start, other._list_array_shapes())
         )
@@ -195,7 +199,11 @@ class TracedNetwork:
         return shapes, self.error.steps, self.error.horizon is None, self.young
 
     def make_system(self, x: Array) -> ModeSystem:
-        """Return the system of the best linear filter where the free numbers have the values x (numbers,)."""
+        """Return the system of the best linear filter where the free numbers have the values x (numbers,).
+
+        `young`: whether the scalar of Young's inequality is among the numbers, which is none of the network's own.
+        UNTRACEABLE: errors of JAX where a function reads a traced number.
+        """
         values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
         try:
@@ -221,7 +229,10 @@ class TracedNetwork:
 def compile_programs(
     network: TracedNetwork,
 ) -> tuple[Callable[[Array], ModeSystem], Callable[[Array, ModeSolution], ErrorAndPowerSlopes]]:
-    """Return the compiled programs of a network's system and derivatives; equal networks share them."""
+    """Return the compiled programs of a network's system and derivatives; equal networks share them.
+
+    PROGRAMS: so many of the last ones are kept.
+    """
     return compile_on_call(network.make_system), compile_on_call(network.differentiate_by_numbers)
 
 
@@ -253,6 +264,11 @@ class FreeNumberProblem:
     """A network that is a function of numbers, as a descent needs it; the last point is cached."""
 
     def __init__(self, build: Build, numbers: FreeNumbers, error: Error):
+        """Read the network at the starts of its free numbers, and compile its programs.
+
+        Where a mean gain is uncertain, the scalar of Young's inequality is one more free number (`young`), with which
+        the error is bounded.
+        """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
         check_time_variation(network, error)
@@ -264,7 +280,10 @@ class FreeNumberProblem:
         self._last: dict[tuple[bytes, int | None], EvaluatedPoint] = {}
 
     def network(self, x: Vector) -> Network:
-        """Return the network at these numbers."""
+        """Return the network at these numbers.
+
+        The scalar of Young's inequality (YOUNG) is none of its numbers.
+        """
         named = self.numbers.split_by_name(x).items()
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
@@ -274,6 +293,8 @@ class FreeNumberProblem:
         """Raise ValueError where a number near an end of its range, the others at their starts, makes no network.
 
         An end itself may be one that is never reached, as a noise of variance zero.
+
+        INSIDE: how near to an end a number is put, as a share of the way to its start.
         """
         starts = {name: number.start for name, number in self.numbers.by_name.items()}
         for name, (start, low, high) in self.numbers.by_name.items():
@@ -294,6 +315,7 @@ class FreeNumberProblem:
             ValueError: an error that grows without limit, powers that do.
         """
         criterion = self.criterion if criterion is None else criterion
+        # Only the last point is kept: a search asks for its error, then for its slopes.
         key = x.tobytes(), criterion.sharpness
         if key not in self._last:
             system = ModeSystem(*(None if v is None else np.asarray(v) for v in self._system(np.asarray(x))))
@@ -323,7 +345,10 @@ class FreeNumberProblem:
         )
 
     def descent_problem(self) -> DescentProblem:
-        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
+        """Return the problem of a descent, in units of the numbers' ranges, or of their starts where they have none.
+
+        LEAST_UNIT: the unit of numbers whose range and start are less.
+        """
         low, high = self.numbers.low, self.numbers.high
         unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), LEAST_UNIT)
         return DescentProblem(

@@ -229,6 +229,7 @@ def _find_laws_and_chain(
     """
     pairs = list(zip(modes, lengths, strict=True))
     if modes[0].forgets:
+        # Modes that are drawn anew at each step: after any mode the next has this law.
         law: Array = jnp.concatenate([jnp.tile(of_span.initial, (length, 1)) for of_span, length in pairs])
         chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
         return law, chain
@@ -269,6 +270,9 @@ def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedM
 
 def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
     """Return the joint modes of a channel that delivers the modes of all its chains beside its other outputs.
+
+    A flag: an output that is a chain's mode itself. A gain that drifts has no
+    such modes.
 
     Raises:
         ValueError: a chain whose mode is not delivered.

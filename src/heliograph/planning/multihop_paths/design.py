@@ -60,7 +60,7 @@ class PathProblem(NamedTuple):
     def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
         """Return the error, -d error / d j of each free hop's path, and d error / d p (both (time, free)).
 
-        By one adjoint recursion, at the free powers p (time, free).
+        By one adjoint recursion, at the free powers p (time, free). j: information of a path; `path`: that of each hop.
         """
         information, slope = self.information(powers)
         p = compute_error_covariances(self.paths, information)
@@ -201,7 +201,11 @@ def make_power_task(
     """
 
     def information(powers: Powers) -> PathInformation:
-        """Return the information of all paths and its slope by the free powers, the others being fixed."""
+        """Return the information of all paths and its slope by the free powers, the others being fixed.
+
+        `fixed`: powers of all hops (time, hop), of which those of the hops `free` are replaced by `powers`
+        (time, free).
+        """
         of_all_hops = fixed.copy()
         of_all_hops[:, free] = powers
         of_paths = compute_path_information(paths, of_all_hops)
@@ -228,7 +232,7 @@ def make_power_task(
 def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts where none is given: what peaks and means allow, or plenty.
 
-    Plenty is so much that the noise of a hop hardly counts, ten times the largest alpha.
+    Plenty is so much that noise hardly counts: ten times the largest alpha, at which half of what arrives is noise.
     """
     largest = np.minimum(limits.peak.mean(axis=0), limits.mean)
     plenty = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -322,7 +326,7 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the powers of the least total that reaches a target, by descents from the starts; None where none does.
 
-    Each start is raised first until it reaches the target.
+    Each start is raised first until it reaches the target. `scale`: size of the powers, in which the search steps.
     """
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
@@ -337,7 +341,7 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
     """Return the start times the least factor that reaches the target, as far as peaks and means allow; else None.
 
-    By bisection of the factor's logarithm.
+    By bisection of the factor's logarithm, between the ends FACTORS.
     """
 
     def reaches(factor: float) -> bool:
@@ -353,10 +357,10 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError where the target is not above the error that remains however much is sent."""
+    """Raise ValueError where the target is not above (by REACHED) the error that remains however much is sent."""
     limits = task.problem.limits
     bounded = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
-    # The most that each may send: up to its peak, or plenty, or its whole mean power in one step.
+    # The most that each may send: up to its peak, or plenty (UNLIMITED), or its whole mean power in one step.
     most = np.minimum(limits.peak, UNLIMITED * np.maximum(task.problem.paths.alpha[:, task.free], 1.0))
     most = np.minimum(most, limits.mean * len(most))
     left = task.problem.compute_exact_error(most)

@@ -60,6 +60,8 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: 2^k steps after k doublings.
 
+    It is reached when a doubling changes H by no more than a share CONVERGED.
+
     Raises:
         ValueError: covariances that grow without limit.
     """
@@ -104,6 +106,7 @@ def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weig
     `information`: J_k; `p`: P_k; `weights`: derivative W_k of the cost by P_k alone; all (time, n, n).
     """
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
+    # A single mode, that is always on: its recursion is X+ = phi X phi'.
     always = JumpSystem(np.ones((len(p), 1, 1)), phi[:, None], np.zeros_like(phi[:, None]))
     return always.adjoint(weights, plants.start is None)[:, 0]
 
@@ -246,6 +249,7 @@ def _arrange_by_place(
     order = np.argsort(paths.path, kind="stable")
     counts = np.bincount(paths.path, minlength=paths.second.shape[1])
     position = np.empty_like(paths.path)
+    # A hop's number in the order by paths, less that of the first hop of its path.
     position[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
     along = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
     along[:, paths.path, position] = values
@@ -253,7 +257,7 @@ def _arrange_by_place(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return p / (p + alpha) of each hop (time, hop); 1 of one without noise, whatever its power."""
+    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop); alpha in sent power."""
     total = powers + alpha
     # A hop without noise: any power does.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))

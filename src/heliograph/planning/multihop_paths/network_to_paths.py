@@ -190,6 +190,7 @@ def _split_loss(mixture: Mixture) -> tuple[AbstractRandomAffine, float]:
     """
     p = np.asarray(mixture.choice.probabilities)
     audible = [index for index, affine in enumerate(mixture.maps) if not _delivers_nothing(affine)]
+    # More than one corner: the probabilities are uncertain.
     if len(audible) != 1 or mixture.corner_count() > 1 or not p[audible[0]] > 0:
         raise _make_no_paths_error("a mixture of several channels")
     return mixture.maps[audible[0]], 1 / float(p[audible[0]])
@@ -262,6 +263,8 @@ def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance
     """Raise ValueError where two paths of a node carry correlated noise of its sensor.
 
     `rows`: combination of the outputs that each path carries; `covariance`: of the sensor's noise.
+
+    UNCORRELATED: a correlation that is rounding.
     """
     noise = rows @ covariance @ rows.T
     deviation = np.sqrt(np.diag(noise))

@@ -54,7 +54,11 @@ class SplitPaths(NamedTuple):
 
 
 def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
-    """Return the paths by the power that their free hops send together; the others send the powers `fixed`."""
+    """Return the paths by the power that their free hops send together; the others send the powers `fixed`.
+
+    `fixed`: powers (time, hop). DEAD: a number so large that the path carries nothing, for one that a silent hop
+    cuts.
+    """
     full = paths.second * compute_path_kappas(paths)
     # alpha of the free hops of each path.
     free_hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
@@ -147,6 +151,7 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
         p, falls = _split_at_multiplier(alpha, log_l)
         reached = p.sum(axis=-1, keepdims=True)
         excess = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
+        # `falls` is -d sum p / d log l: Newton's step for the logarithm of the sum.
         step = np.divide(excess * reached, falls, out=np.zeros_like(falls), where=falls > 0)
         log_l = log_l + step
         if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
@@ -177,7 +182,11 @@ class Envelope(NamedTuple):
     ray: PathValues
 
     def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
-        """Return the envelope and its slope at these powers of the paths."""
+        """Return the envelope and its slope at these powers of the paths.
+
+        The envelope is the least concave function above the information: up to the power `touch` a straight
+        line of slope `ray` from 0, then the information itself.
+        """
         exact = split_power_over_hops(self.whole, total)
         on_ray = total < self.touch
         return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)

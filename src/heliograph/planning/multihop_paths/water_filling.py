@@ -110,6 +110,7 @@ def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) 
     ]
     highest = np.broadcast_to(of_means, dry.shape)
     level = _find_level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
+    # A transmitter at its mean keeps its own level where that of the total is higher.
     return limits.clip_powers(_fill_to_level(np.minimum(level, highest), rise, dry, limits.peak))
 
 
@@ -119,7 +120,10 @@ def _fill_to_level(
     dry: Float[np.ndarray, "*k"],
     peak: Float[np.ndarray, "*k"],
 ) -> Float[np.ndarray, "*k"]:
-    """Return the powers min([level rise - dry]^+, peak), of the arguments' shape; 0 where rise is 0, at any level."""
+    """Return the powers min([level rise - dry]^+, peak), of the arguments' shape; 0 where rise is 0, at any level.
+
+    Powers as water: each place is filled above its ground `dry`, the faster the larger `rise`, up to its peak.
+    """
     with np.errstate(invalid="ignore"):
         wet = np.where(rise > 0, level * rise - dry, 0.0)
     return np.clip(wet, 0.0, peak)
