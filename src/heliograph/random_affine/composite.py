@@ -76,7 +76,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the angles of every map: all choices must agree."""
+        """Return which outputs are angles, if the inputs `sent` are: one of `maps` is in force, so all must agree."""
         results = {affine.carry_angles(sent) for affine in self.maps}
         if len(results) > 1:
             raise refuse_gain_on_angles(type(self).__name__)
@@ -92,7 +92,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return visited, max((after for _, after in pairs), key=lambda after: after.hops)
 
     def check_shapes(self, name: str) -> None:
-        """Raise ValueError where the maps have several shapes."""
+        """Raise ValueError, with the `name` of what has these maps, where they have several shapes."""
         shapes = [(m.outputs, m.inputs) for m in self.maps]
         if len(set(shapes)) != 1:
             raise fail(name, "maps of one shape", shapes)

@@ -41,7 +41,7 @@ class GainLawGivenReading(AbstractLaw):
 
 
 def require_density(law: AbstractLaw) -> AbstractLaw:
-    """Return a law of which readings can be used: one with a density, or of finitely many values.
+    """Return a gain's law if readings of the gain can be used: one with a density, or of finitely many values.
 
     Raises:
         ValueError: another law, probabilities that are uncertain.
@@ -100,7 +100,10 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:
-        """Return log p(t | a) but for a constant: the law's density in t, and the reading's."""
+        """Return log p(t | a) but for a constant: the law's density in t, and the reading's, a = g + e.
+
+        The gain is g = e^t of a `logarithmic` law, else t^4; `deviation`: of e.
+        """
         g = to_gain(t)
         stretch = t if law.logarithmic else 3 * jnp.log(t)  # log dg/dt, but for a constant
         return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2
@@ -130,7 +133,7 @@ def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array)
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the neighbours of the best point of a grid between these ends."""
+        """Return the neighbours of the best point of a grid between these ends; `steps`: its points from 0 to 1."""
         left, right = ends
         points = left + (right - left) * steps
         best = jnp.argmax(jax.vmap(log_density)(points))
@@ -153,7 +156,10 @@ def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the cell of a grid in which the density rises above `least`, from the outer end to the inner one."""
+        """Return the cell of a grid in which the density rises above `least`: its outer end and its inner one.
+
+        `steps`: the grid's points, from 0 at the outer end to 1 at the inner one, where the density is above.
+        """
         outside, inside = ends
         points = outside + (inside - outside) * steps
         is_above = (jax.vmap(log_density)(points) > least).at[-1].set(True)
@@ -196,7 +202,7 @@ def gain_quadrature(
 def reading_quadrature(
     law: AbstractLaw, variance: float
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
-    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum.
+    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum (quadrature).
 
     Args:
         law: of the gain g, as `gain_quadrature` takes it.
