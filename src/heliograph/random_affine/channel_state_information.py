@@ -127,7 +127,7 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def reason_for_no_claim(self) -> str:
-        """Why no claim is made of what is told, as it is said of the numbers; "" where one is."""
+        """Why no covariance is claimed by what is told, as said of the numbers ("depends ..."); "" where one is."""
         said = ["depends on the state"] * (not self.exogenous)
         said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
         return " and ".join(said)
@@ -372,7 +372,7 @@ def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarr
     lower, pivots = eliminate(jnp.asarray(matrix))
     variances = jnp.diagonal(jnp.asarray(matrix))
     positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
-    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)
+    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)  # 0 if L diag(d) L', d >= 0
     return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 

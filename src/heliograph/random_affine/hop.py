@@ -133,7 +133,7 @@ class GainAndNoise(AbstractHop):
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """Return the moments with E[g^k] of each extreme law."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner: an extreme law of the gain g that is possible."""
         gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
         return moment_map

@@ -129,7 +129,7 @@ LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
+    """Return where a density with one mode in [low, high] is largest: at the best of GRID points, ZOOMS times finer."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

@@ -300,7 +300,7 @@ class GivenMoments(AbstractLaw):
         raise fail("simulating a gain known by its moments only", "a law that can be sampled", "GivenMoments")
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return the given E[g^order]."""
+        """Return E[g^order] of the gain g, one of the given moments; raise ValueError above these."""
         if order == 0:
             return 1.0
         if order > len(self.moments):
