@@ -65,7 +65,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
         So every law that is possible lies between these.
         """
-        # Of the possible choices only those with weights of their own.
+        # The extreme laws of the choice, all of which are Discrete.
         corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
         return tuple(
             Mixture(parts, law.probabilities)

@@ -72,7 +72,10 @@ class StudentT(AbstractNoise):
         return True
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches, one for each of the PRECISIONS."""
+        """Return Student's law of each component as a mixture of Gaussian branches, one for each of the PRECISIONS l.
+
+        By component and branch: logarithm of the probability, mean (0) and variance, the scale's divided by l.
+        """
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
         shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
@@ -83,7 +86,7 @@ class StudentT(AbstractNoise):
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw A w / sqrt(l), w standard normal."""
+        """Draw Gaussian noise of the scale divided by sqrt(l), l of the gamma law of mean 1: Student's noise."""
         first, second = jax.random.split(key)
         half = jnp.asarray(self.degrees, dtype=float) / 2
         precision = jax.random.gamma(second, half, dtype=float) / half
@@ -91,6 +94,8 @@ class StudentT(AbstractNoise):
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
+
+        The noise is Gaussian noise divided by sqrt(l), l chi-squared of nu degrees divided by nu. Odd moments are 0.
 
         Raises:
             ValueError: an order of at least `degrees`, whose moment does not exist.
@@ -202,7 +207,10 @@ class Contaminated(AbstractNoise):
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches about the mean, those of the law."""
+        """Return each component as a mixture of Gaussian branches about the noise's mean: without and with outliers.
+
+        By component and branch: logarithm of the probability, mean and variance.
+        """
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
@@ -226,7 +234,11 @@ class Contaminated(AbstractNoise):
 
 
 def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
-    """Return the gamma law's mass of l between geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
+    """Return the share of each of the PRECISIONS, at least LEAST_SHARE, in Student's law as a mixture of Gaussian ones.
+
+    The precision l has the gamma law of mean 1, chi-squared of the degrees divided by these. A share is the mass of l
+    between the geometric means of neighbouring PRECISIONS.
+    """
     xp: Any = library(degrees)
     half = xp.asarray(degrees) / 2
     between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
@@ -238,7 +250,10 @@ def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
 
 
 def has_bounded_noise(*parts: PyTree) -> bool:
-    """Return whether some noise in these parts of a network is known by a bound of its covariance alone."""
+    """Return whether some noise in these parts of a network is known by a bound of its covariance alone.
+
+    Only contaminated noise can be: of at most a share of outliers.
+    """
 
     def is_law(leaf: object) -> bool:
         """Return whether a leaf is a noise law that may be a bound."""
@@ -265,7 +280,10 @@ def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
 
 
 def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
-    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many."""
+    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many.
+
+    `several`: whether a list of kinds was given. Then a number (rank 0) is that of every kind.
+    """
     if not several:
         return [value]
     if not rank(name, value):
@@ -277,11 +295,11 @@ def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> li
 
 
 def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and variance of the exponential law of mean 1 between its quantiles k / count.
+    """Return the mean and variance, in each of `count` slices of equal probability, of the exponential law of mean 1.
 
-    With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
+    With the survival S from 1 down to 0 and t = -log S: the integrals of t and t^2 over a slice of S, times count.
     """
-    survival = 1 - np.arange(count + 1) / count
+    survival = 1 - np.arange(count + 1) / count  # at the slices' ends; at 0 the logarithm is multiplied by 0
     time = -np.log(np.where(survival > 0, survival, 1.0))
     first = count * -np.diff(survival * (time + 1))
     second = count * -np.diff(survival * (time**2 + 2 * time + 2))

@@ -81,7 +81,7 @@ def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
 
 
 def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
-    """Raise if a moment matrix would need more than the stated memory."""
+    """Raise ValueError if a moment matrix, named `what`, would have more than MEMORY_LIMIT_ENTRIES."""
     if rows * columns > MEMORY_LIMIT_ENTRIES:
         got = f"{rows * columns:,} entries; use a lower order, or fewer states, outputs or stacked sensors at once"
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
@@ -181,7 +181,11 @@ def degrees(dimension: int, order: int) -> np.ndarray:
 
 @cache_arrays
 def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
+    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b).
+
+    For all monomials a of (y, 1) of this order, y of `dimension`. Places are among these: b and a - b are times powers
+    of 1.
+    """
     places, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
@@ -222,7 +226,7 @@ class JointMoments(Module):
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
-        """Return E[Sym^order(H)] of a lower order, whose monomials are among these."""
+        """Return E[Sym^order(H)] of a lower order: times powers of 1, its monomials are among those of `self.order`."""
         places = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
         matrix: jax.Array | np.ndarray = self.matrix[places]
         return matrix
@@ -254,7 +258,7 @@ def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], Joi
 
     @wraps(written)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from what the map's own method returns: these, or their matrix."""
+        """Return the moments of this order, from what the map's own method, `written`, returns: they or a matrix."""
         result = written(channel, order)
         if isinstance(result, JointMoments):
             return result

@@ -57,10 +57,12 @@ class Flips(AbstractRandomAffine):
         return Discrete(1 - 2 * self.error.values, self.error.probabilities)
 
     def about_centre(self, power: Float[np.ndarray, " words"]) -> AbstractRandomAffine:
-        """Return the random affine map of q - c: gain g, and noise of variance U (1 - E g^2).
+        """Return the random affine map of q - c, words less their centre: gain g, and noise of variance U (1 - E g^2).
+
+        Where each word draws a gain of its own, it is a stack of one map a word.
 
         Args:
-            power: U of each word.
+            power: U of each word, its variance were all its values equally likely.
         """
         left = 1 - float(self.gain.moment(2))
         if self.per_message or self.dimension == 1 or isinstance(self.error, Constant):
@@ -111,7 +113,10 @@ class BitFlips(AbstractRandomAffine):
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw p, of the message or of each word, and the bits that flip."""
+        """Draw p, of the message or of each word, and the bits that flip: return the diagonal H, -1 at these, else 1.
+
+        Each word is `bits` numbers -1 or 1, and `beside` numbers behind them that never flip; the constant 1 is last.
+        """
         rate_key, bit_key = jax.random.split(key)
         if self.per_message:
             p = jnp.full(self.dimension, self.error.sample(rate_key))

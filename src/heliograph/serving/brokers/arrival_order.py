@@ -41,7 +41,10 @@ class ArrivalOrder:
         self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest
 
     def add_messages(self, payloads: Sequence[Payload]) -> list[Payload]:
-        """Take messages; return those that no longer wait, since more than HELD would."""
+        """Take messages; return the earliest of those that wait, as many as are more than HELD.
+
+        A heap orders them by moment, and by their count where moments are equal.
+        """
         results = list[Payload]()
         for payload in payloads:
             self._last = self._find_moment(payload)
@@ -79,7 +82,10 @@ class ArrivalOrder:
                 self._held[self._held.index(entry)] = entry._replace(payload=error)
 
     def _find_moment(self, payload: Payload) -> float:
-        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before."""
+        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before.
+
+        In seconds since 1970, or as the number that it has.
+        """
         message = payload.read if isinstance(payload, UnreadMessage) else payload
         if not isinstance(message, Message | NumberedMessage):
             return self._last

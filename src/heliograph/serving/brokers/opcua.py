@@ -128,10 +128,10 @@ class OpcUa:
         """Prepare to read a server's variables by a translator's sources; outputs go to file descriptor `target`."""
         self.address, self._translator = address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(address))
-        self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
+        self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()  # messages of each change, not yet received
         self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
-        self.reporting: dict[str, Reporting] = {}
+        self.reporting: dict[str, Reporting] = {}  # how often, and from which change on, each variable is reported
 
     async def receive(self) -> Batch | None:
         """Wait for changes of the nodes that are subscribed to, and return what came together."""
@@ -221,7 +221,7 @@ class Listener:
             topic.kind = self.kinds[name]
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Note a change; of a variable's first value only that it is there."""
+        """Note a change in the statistics of its topic; of a variable's first value, which may be old, no times."""
         name, body = _translate_change(node, val, data)
         stored = name not in self.topics
         note_payload(self.topics, name, body, time.time_ns())
