@@ -53,7 +53,8 @@ class EstimateWriter:
         """Return a line of a row with `size` outputs, with %b or %d for each number, and what fills it.
 
         That is the outputs' columns in the order in which the line has them, and which of its places take whole
-        numbers. The line is written from a row that has FIRST + its column number in each column.
+        numbers. The line is written from a row that has FIRST + its column number in each column: so the number that
+        stands at a place (found by COLUMN) tells its column, and without a point that it is written as a whole one.
         """
         numbered = FIRST + np.arange(float(size))
         numbered[self._reasons] = 0.0  # nothing is refused

@@ -28,6 +28,7 @@ class NeighbourMessenger:
     def __init__(self, fleet: Fleet, moment: Moment):
         self.fleet, self._moment = fleet, moment
         nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
+        # The filter of the node that this network is; "" and None where it is no single node, which sends nothing.
         self._name = next(iter(nodes), "")
         self._node = nodes.get(self._name)
 

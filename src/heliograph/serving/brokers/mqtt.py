@@ -158,7 +158,7 @@ class _Reader(Connection):
         return batch
 
     def _read_payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
-        """Return a message in our form as it is, and of another topic what the sources read in it."""
+        """Return a message in our own form, below `_prefix`, as it is; of another topic what the sources read in it."""
         if self._translator is None or message.topic.startswith(self._prefix):
             return [bytes(message.payload)]
         return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)

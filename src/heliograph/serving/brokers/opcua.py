@@ -131,7 +131,7 @@ class OpcUa:
         self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()  # messages of each change, not yet received
         self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
-        self.reporting: dict[str, Reporting] = {}  # how often, and from which change on, each variable is reported
+        self.reporting: dict[str, Reporting] = {}  # deadband and interval by variable
 
     async def receive(self) -> Batch | None:
         """Wait for changes of the nodes that are subscribed to, and return what came together."""
@@ -155,7 +155,9 @@ class OpcUa:
                 await asyncio.wait_for(self._client.disconnect(), WAIT)
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Put a change of a variable into the queue, as messages; its first value was there before, as stored ones.
+        """Put a change of a variable into the queue, as messages.
+
+        Its first value was there before: it counts as stored, as one that a broker had kept.
 
         `val`: the new value; `data`: its dates and its quality.
         """

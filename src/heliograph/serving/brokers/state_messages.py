@@ -124,7 +124,10 @@ def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
 def _iterate_states(
     topic: str, states: Sequence[str], estimate: Mapping[str, Any]
 ) -> Iterator[tuple[_PublishedState, int, Mapping[str, Any]]]:
-    """Yield each state of each filter, with its number and the filter's estimate."""
+    """Yield each state of each filter and node in a published `estimate`: with its topic, its number, and the filter's.
+
+    The last is the filter's part of the estimate, such as its mean. Topics have names as single words.
+    """
     plant = str(estimate["plant"])
     for node, filters in estimate["estimates"].items():
         for name, message in filters.items():

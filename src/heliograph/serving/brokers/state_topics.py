@@ -89,7 +89,7 @@ class _StateWriter(Connection):
         self.start()
 
     def publish(self, plant: str | None, body: bytes) -> None:
-        """Publish the states of an estimate of a plant."""
+        """Publish the states of an estimate of a plant, now and again with each new connection."""
         with self._one_at_a_time:
             self._newest[plant] = body
             if self.client.is_connected():
@@ -116,7 +116,7 @@ class _StateWriter(Connection):
                 self._publish(body)
 
     def close(self) -> None:
-        """Say offline, which a connection that ends in order does not."""
+        """Say offline, and end: the last will, which would say it, is only for connections that break."""
         if self.client.is_connected():
             self.client.publish(self._available, OFFLINE, AT_LEAST_ONCE, retain=True).wait_for_publish(2.0)
         super().close()

@@ -56,7 +56,7 @@ class _Examination:
     def __init__(self, broker: Broker, messages: int, patience: float):
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
-        self._numbers = count()
+        self._numbers = count()  # of the messages, each of which has another
 
     async def check_all(self) -> bool:
         """Check each promise in turn, with one service after another; return whether redelivery keeps the order."""
