@@ -106,7 +106,8 @@ class EstimateWriter:
     def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
         """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON.
 
-        `columns` are the filter's among `outputs`, the numbers of a row.
+        `columns` are the filter's among `outputs`, the numbers of a row. The claim says what the covariance is worth:
+        "exact", "upper" (a bound), "none" and so on.
         """
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row

@@ -229,7 +229,7 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
 
 
 def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
-    """Return an event as the fields of a message, without its arrival."""
+    """Return an event as the fields of a message, without its arrival; NaN as null. `origin`: date of time 0."""
     values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
     name = {"plant": plant} if plant else {}
     moment = {"time": _format_time(event.time, origin)}

@@ -240,8 +240,9 @@ class Translator:
         return time
 
     def _count_reading(self, reading: Reading, repeatable: bool) -> int:
-        """Return a reading's own count, or else a number: among those of its node and time, or of its node.
+        """Return the reading's own count; without one, its number among those of its node and time, from 0.
 
+        Without a time either, its number among all of its node.
         `repeatable`: whether a copy of it may come again, which gets the same number.
         """
         if reading.sequence is not None:

@@ -102,7 +102,10 @@ class _DiscoveredSensor(NamedTuple):
 
 
 def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
-    """Return the sensors of a state: its value and deviation, and a dead sender, if its node has one that may be."""
+    """Return the sensors of a state as Home Assistant has them: value, deviation, and whether its sender is dead.
+
+    The last where the node has a sender that may be found dead (`has_sender`).
+    """
     number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
     sensors = [
         _DiscoveredSensor("sensor", "value", place.label, number),

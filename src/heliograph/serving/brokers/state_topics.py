@@ -96,7 +96,7 @@ class _StateWriter(Connection):
                 self._publish(body)
 
     def _publish(self, body: bytes) -> None:
-        """Publish states, and before the first of a filter what Home Assistant has to know."""
+        """Publish states, and before the first of a filter, with `discovery`, what Home Assistant has to know."""
         topic = self._topics.address.topic
         if self._topics.discovery:
             for message in make_discovery_messages(topic, self._states, body, self._topics.discovery):

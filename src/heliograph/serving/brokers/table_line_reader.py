@@ -157,7 +157,10 @@ class TimeRowReader:
         )
 
     def end(self) -> list[Payload]:
-        """Return the messages of the rows of a file."""
+        """Return the messages of the rows of a file, now that all have come, and why others have none.
+
+        Messages are lines of JSON. Doubts about the rows (warnings) are logged.
+        """
         if not self._cells:
             return []
         with warnings.catch_warnings(record=True) as doubts:

@@ -66,6 +66,7 @@ class StoreProtocol(Protocol):
     ) -> list[Output]:
         """Commit plants, which must have the versions that they were read with, and outputs.
 
+        Returns the outputs of the `entries` with their numbers. `malformed`: how many messages could not be read.
         `published` is the number of the last output that was published, None if that has not changed.
 
         Raises:
@@ -122,7 +123,7 @@ class InMemoryStore:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Number the outputs, counting from 1."""
+        """Return the outputs of the entries, numbered on from 1; nothing is kept."""
         begin = self._number + 1
         self._number += len(entries)
         return Entry.numbered(entries, begin)

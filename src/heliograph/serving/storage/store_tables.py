@@ -27,7 +27,7 @@ def checksum(name: str | int, *values: str | int | bytes) -> int:
 
 
 def is_row_undamaged(written: object, name: object, *values: object) -> bool:
-    """Return whether a row is as it was written; a damaged row may contain anything."""
+    """Return whether a row has the checksum `written` with it; a damaged row may contain anything."""
     if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
         return False
     return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
