@@ -43,7 +43,7 @@ class AbstractFreshDraw(AbstractMemory):
         return self.begin(key)
 
     def nodes(self, degree: int) -> MemoryStates:
-        """Refuse: what is told is no mode that a filter must find out.
+        """Refuse to list states: what a message tells is no hidden mode that a filter must find out.
 
         Raises:
             ValueError: always.
@@ -384,7 +384,7 @@ def make_laws_certain(link: T) -> T:
     """
 
     def certain(leaf: object) -> object:
-        """Return a law of finitely many gains, or a map of modes, as one whose probabilities are certain."""
+        """Return a law of finitely many gains, or a map of modes, as one of certain probabilities; else the leaf."""
         if isinstance(leaf, Discrete):
             return CertainDiscrete(leaf)
         if isinstance(leaf, AbstractModal) and isinstance(leaf.memory, MarkovChain):

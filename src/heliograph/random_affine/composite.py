@@ -85,6 +85,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map with `visit` applied to each hop of each of its maps, and the position behind the longest.
 
+        A hop is a transmitter with its link; the position counts those before it.
         All maps begin at `position`: hops at equal places are the same transmitters in each of them.
         """
         pairs = [affine.visit_hops(visit, position) for affine in self.maps]

@@ -75,6 +75,7 @@ class DelayLine(AbstractDelayLine):
 
     def __init__(self, link: AbstractRandomAffine, past: int):
         check_maps("link", [link])
+        # The link takes a line of 1 + past signals: the present one and past ones.
         self.link, self.steps = link, check_count("past", past)
         if link.inputs % (1 + past):
             raise fail("link", f"inputs of {1 + past} signals of one length", link.inputs)

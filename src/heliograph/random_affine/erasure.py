@@ -42,7 +42,10 @@ class Erasure(AbstractMapWrapper):
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[ArrivalOutcome]:
-        """Return the two outcomes: what the map delivers, or nothing."""
+        """Return the outcomes: each of the map's own with the probability that it arrives; and that nothing does.
+
+        An outcome: its probability, the map then, and which outputs arrive.
+        """
         arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
         listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
         return [*listed, ArrivalOutcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]

@@ -91,7 +91,7 @@ class GainAndNoise(AbstractHop):
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw [[g A, n], [0, 1]]."""
+        """Draw H = [[g A, n], [0, 1]] of z = g A y + n: a random gain g and a noise n."""
         gain_key, noise_key = jax.random.split(key)
         top = jnp.concatenate(
             [self.law.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],

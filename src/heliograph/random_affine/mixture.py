@@ -121,7 +121,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
+        """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
         moments = self.moments(2)
         mean = moments.mean
         second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1

@@ -274,7 +274,7 @@ class Independent(AbstractNoise):
         return stack_branches([component.branches() for component in self.parts])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return mean and covariance of the parts without their outliers, one above the other and uncorrelated."""
+        """Return mean and covariance of the independent parts without their outliers, one above the other."""
         parts = [component.without_outliers() for component in self.parts]
         mean = library(parts).concatenate([part.mean for part in parts])
         return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))

@@ -49,7 +49,7 @@ class StudentT(AbstractNoise):
 
     @property  # type: ignore[misc]
     def covariance(self) -> Square:  # type: ignore[override]
-        """Covariance of the noise: the scale times nu / (nu - 2).
+        """Covariance of the noise: the scale times nu / (nu - 2), nu its degrees of freedom.
 
         Raises:
             ValueError: at most 2 degrees.
@@ -175,6 +175,7 @@ class Contaminated(AbstractNoise):
         xp = library(factor, inlier, share)
         units = xp.broadcast_to(factor, (n,))
         slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
+        # A slice adds its mean to the noise, and its variance along `units` to the covariance.
         spreads = [inlier + v * xp.outer(units, units) for v in variance]
         return cls(inlier, xp.stack([slice_share] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
 
@@ -182,7 +183,8 @@ class Contaminated(AbstractNoise):
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
         """Return zero-mean noise known by bounds: at most this share of outliers, E[o o'] at most this matrix.
 
-        (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
+        R: `covariance` of the noise without outliers; G: `outlier_second_moment`; e: `share`. (1 - e) R + e G dominates
+        the covariance for every share up to e, since G >= R.
 
         Raises:
             ValueError: as for the class; a second moment of outliers that does not dominate the covariance.
@@ -221,7 +223,7 @@ class Contaminated(AbstractNoise):
         return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the branch by the shares, then the noise from it."""
+        """Draw the branch, without or with outliers, by the shares; return the noise of its Gaussian law."""
         first, second = jax.random.split(key)
         branch = draw_index(self.shares, first)
         laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
@@ -307,7 +309,7 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:
-    """Return the logarithms, -inf of zero without a warning."""
+    """Return the logarithms, -inf of zero without a warning, of NumPy or JAX (traced) numbers."""
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):

@@ -128,7 +128,7 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        """Return E[Sym^k(H)] of the series, k = `order`: E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
         matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
@@ -189,7 +189,7 @@ class Series(AbstractCombination):
         return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the series without the noise of its last map where its law has outliers, and that noise."""
+        """Return the series without the noise of its last map where its law has outliers, and that noise; else None."""
         *before, last = self.maps
         plain, noise = last.detach_outliers()
         return (self, None) if noise is None else (Series([*before, plain]), noise)

@@ -68,6 +68,7 @@ class Superposed(AbstractCombination):
             tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))
             for chosen in items("places of the maps of a sum", places, "places of each map")
         )
+        # Places that are not distinct, or not below `inputs`, are fewer than the map's inputs.
         if [len({i for i in chosen if i < inputs}) for chosen in self.places] != [m.inputs for m in self.maps]:
             expected = f"distinct ones below {inputs}, as many as each map has inputs"
             raise fail("places of the maps of a sum", expected, show_value(places))
@@ -92,7 +93,10 @@ class Superposed(AbstractCombination):
 
     @property
     def as_stack(self) -> Series:
-        """The same map as the sum of the outputs of a stack, for what knows only these; its moments are larger."""
+        """The same map as a stack and the sum [I ... I] of its outputs, for what knows only stacks and hops.
+
+        Each map of the stack first selects its components of y. The moments of the stack are larger than the sum's.
+        """
         rows = np.eye(self.inputs)
         stack = Stack([Series([known(rows[list(at)]), m]) for m, at in zip(self.maps, self.places, strict=True)])
         total = np.tile(np.eye(self.outputs), (1, len(self.maps)))
@@ -171,7 +175,10 @@ class Superposed(AbstractCombination):
         return f"sum of {describe_maps_side_by_side(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the sum without the receiver's noise where its law has outliers, and that noise; else None for it."""
+        """Return the sum without its own noise, of which the mean stays, if its law has outliers, and that noise.
+
+        Else the sum as it is, and None.
+        """
         if not self.noise.has_outliers:
             return self, None
         mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
@@ -242,7 +249,10 @@ def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarr
 
 
 def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
-    """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
+    """Return the moments E[t^a | y] of a sum t of independent terms, from those of its halves.
+
+    So polynomials of few variables are multiplied first, which takes least.
+    """
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
@@ -293,7 +303,7 @@ def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, .
 def _place_products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
     """Return the positions of products of monomials of degree `first` in variables a and of degree `second` in b.
 
-    Among the monomials of all `size` variables: entry (i, j) is that of monomial i times monomial j.
+    Among the monomials of degree first + second of all `size` variables: entry (i, j) is that of monomial i times j.
     """
     left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
@@ -327,7 +337,8 @@ def move_sensor_into_links(
 ) -> AbstractRandomAffine | None:
     """Return a sum of links of y = C x + v as a sum of links of x: C_i x + v_i through link i, in fewer numbers.
 
-    None where the parts of v that links carry are not independent, or where the channel does not begin with a sum.
+    C: `matrix`, the sensor's; i: the components of y that link i takes. None where the parts of v that links carry are
+    not independent, or where the channel does not begin with a sum.
     """
     first, *rest = channel.in_series
     if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:

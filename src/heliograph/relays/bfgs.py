@@ -75,7 +75,7 @@ class _DenseInverseHessian:
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
         """Update H after a step s that changed the gradient by y, unless the curvature s'y is not positive.
 
-        H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
+        H: the inverse Hessian, `self.matrix`. H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
         """
         curvature, is_first = float(s @ y), self.is_first_update
         self.is_first_update = False

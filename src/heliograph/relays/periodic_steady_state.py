@@ -57,7 +57,9 @@ def periodic_steps(network: RelayNetwork) -> RelaySteps:
 
 
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
-    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
+    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period of its slots.
+
+    Each filter then minimises its own next error, in each slot. Found by repeating the period, PERIODS times at most.
 
     Args:
         network: relays that filter, in slots that repeat.
@@ -105,7 +107,10 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
 
 
 def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
-    """Return the steps of one period, checked for gains under which the second moments converge."""
+    """Return the steps of one period, one for each slot; raise ValueError where moments do not converge by the gains.
+
+    They do where their linear map over a period has a spectral radius below 1.
+    """
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
     radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
@@ -223,8 +228,9 @@ def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Fl
 def _iterate_local_design(
     steps: RelaySteps, start: Float[Array, "d d"]
 ) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
-    """Repeat the period of the local design until its moments change by less than CONVERGED.
+    """Repeat the period of the local design (gains best for each filter's next error) until its moments are steady.
 
+    They are where they change by less than CONVERGED, relative to the largest.
     Returns gains, moments and power over the last period, and the last relative change of the moments.
     """
     moments, change = _repeat_until_steady(
@@ -259,6 +265,7 @@ def periodic_receiver_error_design(
 ) -> RelayDesign:
     """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
+    P: the receiver's error covariance; slots: turns of the senders, which repeat.
     Descent through the fixed point of the second moments; the result is a local minimum.
 
     Args:
@@ -282,6 +289,8 @@ def periodic_relays_for_best_receiver(
     network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
 ) -> dict[str, Float[np.ndarray, "slots n _"]]:
     """Design relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
+
+    P: that receiver's error covariance.
 
     Args:
         network: the network, which varies with its slots only.

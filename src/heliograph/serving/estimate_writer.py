@@ -97,7 +97,10 @@ class EstimateWriter:
         return lines
 
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
-        """Return all filters' estimates after a row, by node and filter."""
+        """Return all filters' estimates after a row, by node and filter, from the row's numbers `outputs`.
+
+        `_nodes`: by node, where each of its filters has its numbers among these.
+        """
         return {
             node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in places}
             for node, places in self._nodes.items()

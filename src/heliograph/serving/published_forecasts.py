@@ -182,7 +182,10 @@ def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
 
 
 def _add_outputs(bodies: Bodies, names: Sequence[str], mean: np.ndarray, deviation: np.ndarray) -> None:
-    """Add the outputs' means and deviations, each (row, horizon, output), to `bodies`; a NaN deviation as null."""
+    """Add the outputs' means and deviations, each (row, horizon, output), to `bodies`; a NaN deviation as null.
+
+    `bodies`: by row and horizon, what is published of a filter's forecast.
+    """
     for bodies_of_row, *numbers_of_row in zip(bodies, mean.tolist(), deviation.tolist(), strict=True):
         for body, means, deviations in zip(bodies_of_row, *numbers_of_row, strict=True):
             body["outputs"] = {

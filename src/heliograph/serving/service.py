@@ -215,7 +215,7 @@ class Service:
         return [output for output in self.store.unpublished() if (output.number or 0) > known]
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """Note that these outputs were published; the next commit records it."""
+        """Note the largest number of these outputs, which were published; the next commit records it."""
         self._published = max(
             (output.number for output in outputs if output.number is not None), default=self._published
         )
@@ -295,7 +295,7 @@ class Service:
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
 
-        `outcome` has a verdict other than "used", or notes on parts of the message.
+        `outcome` has a verdict other than "used" (None: unread), or notes on parts of the message.
         """
         entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":

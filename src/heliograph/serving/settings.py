@@ -145,6 +145,7 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
 def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float | None]:
     """Return the sources of a node's own messages, by topic (None: it has none), and the seconds of a step.
 
+    A source says how a topic's messages are read. For a service of one node; sources that are no mapping stay.
     The latter are those of all nodes, as any source says them; else as the settings have them.
     """
     sources, step = settings.sources, settings.options.step
@@ -159,9 +160,10 @@ def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float
 
 
 def _is_for_node(row: object, node: str, measures: bool) -> bool:
-    """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
+    """Return whether a source (a `row`) is for a node: its own, of the inputs, or of a node that the message names.
 
-    The last is so if the node measures something. What is no Source is refused later.
+    The last, whose `node` is no text but says where in a message the name is, if the node measures something
+    (`measures`). What is no Source is refused later.
     """
     if not isinstance(row, Source) or row.node in (node, INPUTS):
         return True

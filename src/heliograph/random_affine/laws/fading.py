@@ -87,7 +87,8 @@ def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
 
     By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
     from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) =
-    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits.
+    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. Below: `before` is
+    L_(v-1), `now` L_v.
     """
     if twice_order % 2:
         bessel = scipy_for(x).special
@@ -175,7 +176,7 @@ class LogNormal(AbstractLaw):
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: within 9 deviations of its logarithm."""
+        """Return the interval that holds nearly all of the law: within 9 deviations of the gain's logarithm."""
         xp = library(self.log_mean, self.log_deviation)
         reach = 9 * self.log_deviation
         return xp.exp(self.log_mean - reach), xp.exp(self.log_mean + reach)

@@ -33,7 +33,7 @@ class GainLawGivenReading(AbstractLaw):
         raise fail("a gain given its reading", "a law that can be sampled", "mean and variance alone")
 
     def moment(self, order: int) -> jax.Array:
-        """Return E[g^order | a] up to the second."""
+        """Return E[g^order | a] of the gain g given its reading a, from mean and variance: up to the second."""
         if order > 2:
             raise fail("moments of a gain given its reading", "at most order 2", order)
         powers = jnp.stack([jnp.ones(()), jnp.asarray(self.mean), self.variance + jnp.square(self.mean)])
@@ -66,6 +66,7 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     """
     if isinstance(law, Constant):
         return law
+    # A NaN is no reading: computed with 0 in its place, and then not used.
     known = ~jnp.isnan(reading)
     a = jnp.where(known, reading, 0.0)
     if isinstance(law, Discrete):

@@ -122,8 +122,9 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 
 
 def stack_on_shared_inputs(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
-    """Return the moments of independent maps one above the other that share their first `shared` inputs.
+    """Return the moments E[H] and E[H_ab H_ij] of independent maps one above the other, with common first inputs.
 
+    The first `shared` columns of each map take these; its other columns are its own noises'.
     Between rows of two maps E[H_ab H_ij] is the product of the means.
     """
     placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]

@@ -136,7 +136,10 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
 
 
 def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """Return the moments; raise unless they are those of the channel's inputs up to the order."""
+    """Return the moments; raise ValueError unless they are as many as (y, 1) has monomials of this order, y the input.
+
+    The channel must have no memory.
+    """
     check_forgets("channel of a lift", channel)
     expected = count_monomials(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):

@@ -86,6 +86,7 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])
     corner[-1, -1] = 1.0
+    # m columns, of zeros where the covariance has fewer.
     noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
     return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
 
@@ -180,6 +181,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     same of the law's mean) and the power E[G y y' G'], which leaves out the last row and column of W. They are exact
     where the law is known.
     """
+    # Corners are the extreme ones of the possible laws; None if they are too many.
     corners = count_corners(channel)
     # A single corner: nothing is uncertain.
     if corners == 1:

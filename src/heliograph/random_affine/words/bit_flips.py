@@ -167,7 +167,7 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
 
 
 def _read_error_rate(rate: object) -> Constant | Discrete:
-    """Return the law of a hop's error rate."""
+    """Return the law of a hop's error rate, the probability that a bit is flipped: a number, or finitely many."""
     expected = "one number from 0 to 0.5 for all bits of the word, or a Discrete law of such numbers"
     if isinstance(rate, Discrete):
         values = np.asarray(rate.values)

@@ -36,6 +36,7 @@ class ArrivalOrder:
     """
 
     def __init__(self, source: str, steps: bool) -> None:
+        # Name of the file, for errors; whether times that are numbers are steps.
         self._source, self._steps = source, steps
         self._held = list[HeldPayload]()  # a heap
         self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest
@@ -57,7 +58,7 @@ class ArrivalOrder:
         return results
 
     def take_rest(self) -> list[Payload]:
-        """Return all messages that still wait, in order."""
+        """Return all messages that still wait, in order; refuse those whose clock was never set, if all still wait."""
         if self._count == len(self._held):  # all are here, so that times can be compared with all others
             self._refuse_unset_times()
         return [heappop(self._held).payload for _ in range(len(self._held))]

@@ -193,7 +193,7 @@ class _Reader(Connection):
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
         super().disconnected(client, data, flags, code, more)
-        self._connection += 1
+        self._connection += 1  # what was received before can no longer be acknowledged
 
 
 class _Writer(Connection):

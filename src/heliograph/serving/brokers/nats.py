@@ -63,6 +63,7 @@ class Nats:
         self.address, self.part, self._translator = address, part, translator
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")
+        # The server's stream of messages and its reader, None until there is a connection.
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None

@@ -43,7 +43,9 @@ class Reporting(NamedTuple):
     interval: float
 
     def trigger(self, heartbeat: int | None = None) -> SendOnDelta:
-        """Return the sender of a node whose steps are the sampling intervals, for `hg.Node(..., trigger=...)`.
+        """Return when a node sends, as the server does, for `hg.Node(..., trigger=...)`: at changes of the deadband.
+
+        A step is a sampling interval of the server.
 
         Args:
             heartbeat: steps after which a value is sent in any case; None for never.
@@ -233,7 +235,7 @@ class Listener:
 
 def _make_client(where: Address) -> Client:
     """Return a client of the server at an address, with its user and password if it has any."""
-    # It warns of everything of which a server grants less than it asks for.
+    # The client library warns of everything of which a server grants less than it asks for: not logged.
     logging.getLogger("asyncua").setLevel(logging.ERROR)
     client = Client(str(where), timeout=WAIT)
     if where.user is not None:
@@ -271,7 +273,10 @@ async def _find_variables(client: Client) -> list[Node]:
 
 
 def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
-    """Return the topic of a change and its message; a value of bad quality, or NaN or infinite, becomes null."""
+    """Return the topic of a variable's change, its identifier, and its message: JSON of the value and its dates.
+
+    A value of bad quality, or NaN or infinite, becomes null; what is no number a text.
+    """
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
     if not good or (isinstance(value, float) and not isfinite(value)):  # JSON has neither NaN nor infinity

@@ -80,7 +80,7 @@ class Pipe:
             return self._read_available()
 
     def _warn_if_broken(self) -> None:
-        """Warn, once, that what came could not be unpacked to its end."""
+        """Warn, once, that what came (`_text`, which may be compressed) could not be unpacked to its end."""
         if self._text.broken and not self._said:
             self._said = True
             LOG.warning("%s", self._text.broken)

@@ -188,8 +188,8 @@ def _find_loss_probabilities(loss: float, run: float) -> tuple[float, float]:
 def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     """Delay events as in a recorded trace, and return those that arrive, in order of arrival.
 
-    The trace has one row for each message, and is repeated from its start if there are more messages. Inputs arrive at
-    once.
+    The trace has one row for each message but inputs, which arrive at once, and is repeated from its start if there are
+    more messages.
 
     Args:
         events: the events as they are sent.
@@ -223,7 +223,7 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
         Pairs of the arrival time and the line of JSON.
     """
     for event in events:
-        arrival = event.time if event.arrival is None else event.arrival
+        arrival = event.time if event.arrival is None else event.arrival  # without one: at once
         said = {"arrival": _format_time(arrival, origin)}
         yield arrival, json.dumps(encode_event(event, plant, origin) | said)
 

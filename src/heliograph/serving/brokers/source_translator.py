@@ -65,12 +65,15 @@ class Translator:
             topic: the topic.
             payload: JSON.
             arrival: when it arrived.
-            stored: whether the broker had stored it for new subscribers.
+            stored: whether the broker had stored it for new subscribers: it may be old, and have come before.
         """
+        # The broker may deliver a copy of it again (`repeatable`), which then gets the same number.
         return self._read_payload(topic, payload, arrival, stored, repeatable=True, where=topic)
 
     def topic_of(self, path: Path | None) -> str | None:
-        """Return the topic of messages that name none: that of their file, or the only one; None if there is neither.
+        """Return the topic of messages that name none: one with their file's name, or the only one of the sources.
+
+        None if there is neither.
 
         Args:
             path: the file; None of a pipe.
@@ -226,7 +229,8 @@ class Translator:
     def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
         """Return when a reading was measured: a date, or a number of steps; without a time, when it arrived.
 
-        Raises ValueError, which names the topic, at a date of more than a year before a known arrival.
+        Raises ValueError, which names the topic, at a date of more than a year before a known arrival (`is_known`).
+        A reading's time is in nanoseconds since 1970, or counts steps.
         """
         if reading.time is None:
             return arrival
@@ -271,7 +275,7 @@ class Translator:
 
 
 def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
-    """Return a date, to the microsecond, from nanoseconds since 1970.
+    """Return a date in UTC, cut to the microsecond, from nanoseconds since 1970.
 
     Raises:
         ValueError: beyond the years that dates have.

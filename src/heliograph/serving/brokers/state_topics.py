@@ -82,9 +82,11 @@ class _StateWriter(Connection):
 
     def __init__(self, topics: StateTopics, states: Sequence[str]):
         super().__init__(topics.address, "")
+        # Topics of which Home Assistant was told; the newest estimate by plant, to be published again; its lock.
         self._topics, self._states, self._announced = topics, states, set[str]()
         self._newest, self._one_at_a_time = dict[str | None, bytes](), threading.Lock()
         self._available = availability_topic(topics.address.topic)
+        # The last will: what the broker says for this client when its connection breaks.
         self.client.will_set(self._available, OFFLINE, AT_LEAST_ONCE, retain=True)
         self.start()
 

@@ -37,6 +37,7 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
+        # The class says what these are. The reader of rows is chosen by the header, when it has come.
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
@@ -76,7 +77,10 @@ class TableLineReader:
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
     def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
-        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
+        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time.
+
+        A row of time has the measurements of all nodes; an event is one node's, with its name and count.
+        """
         if {NODE, SEQUENCE} <= set(header):
             own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
             return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))

@@ -72,7 +72,7 @@ FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
 def raise_if_cancelled() -> None:
-    """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
+    """Raise the cancellation again if this task was cancelled: a client library may have caught it and gone on."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError

@@ -40,7 +40,7 @@ class ServiceMetrics(Collector):
         self._texts = LastAnswers(watch.lock, lambda _: text(), text())
 
     def collect(self) -> Iterable[Metric]:
-        """Yield the current metrics."""
+        """Yield the current metrics of all services that `watch` observes, as Prometheus asks for them."""
         yield from _collect_links(self.watch)
         yield from _collect_nis(self.watch)
         yield from _collect_outputs(self.watch)

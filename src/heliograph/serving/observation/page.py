@@ -113,8 +113,8 @@ def make_application(
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
     def page(request: Request) -> Response:
-        """Answer with the page, the first view in place of its only "null"; all others come from /events."""
-        # Without a "<" no name ends the element that the view stands in.
+        """Answer with the page, the first view in place of its first "null"; all others come from /events."""
+        # Without a "<" no name in the view can end the HTML element that it stands in.
         first = json.dumps(watch.make_page_data(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 

@@ -70,7 +70,10 @@ class RememberedPlants:
         return _move_to_newest(self.outputs, plant, lambda: RecentInnovations(MEMORY, self._names))
 
     def keep_point(self, plant: str, message: Mapping[str, Any]) -> None:
-        """Keep a plant's newest estimates as a point of its chart, and what its senders' silence means."""
+        """Keep a plant's newest estimates, a message as sent, as a point of its chart, and what silence means.
+
+        Of each sender in the message: whether it is dead, that is silent for too long.
+        """
         self.count += 1
         estimates = {
             node: {name: _means_and_deviations(estimate) for name, estimate in filters.items()}
@@ -123,7 +126,7 @@ class BatchHistograms:
         self._committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=registry)
 
     def observe(self, batch: BatchTimes) -> None:
-        """Add the times of one batch."""
+        """Add the times of one batch to the histograms: seconds in all, of the commit, and its oldest message's age."""
         self._took.observe(batch.took)
         self._committed.observe(batch.committed)
         self._lag.observe(batch.lag)

@@ -268,7 +268,10 @@ class ServiceWatch:
         }
 
     def _ask_services(self, plant: str) -> ServiceAnswers:
-        """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
+        """Return the names of the services' plants, the counts of messages of one plant, and of what is wrong in all.
+
+        Asked between two batches. The counts are by node, over all services that have the plant.
+        """
         every = list(self.plants())
         return ServiceAnswers(
             names=sorted(name for name, _ in every),
@@ -280,6 +283,7 @@ class ServiceWatch:
     def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
         """Return a row for each fusion without a NIS test of its own: in doubt if that of any estimate it fuses is.
 
+        NIS: normalised innovation squared; a fusion takes the estimates of several filters (`parts`) and no data.
         `by` names the estimates that are in doubt, else all that were tested.
         """
         rows: list[dict[str, object]] = []

@@ -22,6 +22,7 @@ def open_database(location: str) -> Engine:
     """
     engine = create_engine(read_location(location))
     if engine.dialect.name == "sqlite":
+        # Each commit on the disk, and transactions that lock the database from their beginning on.
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_immediate)
     return engine

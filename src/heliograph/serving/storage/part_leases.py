@@ -36,6 +36,7 @@ class Leases:
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
+        # `process`: name of this one; `parts`: number of parts of the plants; `term`: seconds of a lease.
         self.engine, self.process, self.parts, self.term = engine, process, parts, term
         insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
         self._insert = insert

@@ -221,7 +221,7 @@ class Store:
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
     def begin_anew(self, names: Iterable[str]) -> None:
-        """Forget the plants of these names: each begins anew with its next message."""
+        """Remove the plants of these names, damaged or not: each begins anew with its next message."""
         with self._name_store_in_errors("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
@@ -234,7 +234,7 @@ class Store:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Commit plants and outputs in one transaction, as `StoreProtocol` says.
+        """Commit plants and outputs in one transaction; return the outputs with numbers (see `StoreProtocol`).
 
         Raises:
             ConflictError: another process has committed one of the plants.
@@ -377,7 +377,7 @@ class Store:
         self._engine.dispose()
 
     def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
-        """Add to a stored count, which locks it until the commit; return the new value."""
+        """Add `more` to a stored count, which locks it until the commit; return the new value, its checksum renewed."""
         new = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()

@@ -152,7 +152,10 @@ class InMemoryStore:
 
 
 def describe_damaged_plants(plants: Mapping[str, DamagedRow]) -> str:
-    """Return a sentence for users on damaged plants: their names, and whether a name itself was lost."""
+    """Return a sentence for users on damaged plants: the options that begin LISTED of them anew, and if a name is lost.
+
+    `named`: whether a plant's name is as it was written.
+    """
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
     lost_name = ""
