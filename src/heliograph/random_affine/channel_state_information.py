@@ -127,7 +127,7 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def reason_for_no_claim(self) -> str:
-        """Why no covariance is claimed by what is told, as said of the numbers ("depends ..."); "" where one is."""
+        """Why no covariance is claimed from what is told, as said of the numbers ("depends ..."); "" if one is."""
         said = ["depends on the state"] * (not self.exogenous)
         said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
         return " and ".join(said)

@@ -113,7 +113,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit the hops of each map as a choice with transmitters of its own; return the new map, and the position.
 
-        Of several maps that are silent but for one, as a hop or its loss, the transmitters are those of this one place.
+        Where all maps but one deliver noise alone, as a hop or its loss, they are no such choice: the hop is one
+        transmitter of the chain.
         """
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)

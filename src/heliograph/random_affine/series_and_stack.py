@@ -138,7 +138,7 @@ class Series(AbstractCombination):
     def corner_moments(self, order: int) -> Corners:
         """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices.
 
-        A corner is an extreme law of those possible. Corners of the first map vary fastest.
+        A corner is an extreme law of those possible. Those of the first map vary slowest.
         """
         first, *rest = (m.corner_moments(order) for m in self.maps)
         for corners in rest:

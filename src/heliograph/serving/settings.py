@@ -145,8 +145,8 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
 def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float | None]:
     """Return the sources of a node's own messages, by topic (None: it has none), and the seconds of a step.
 
-    A source says how a topic's messages are read. For a service of one node; sources that are no mapping stay.
-    The latter are those of all nodes, as any source says them; else as the settings have them.
+    A source says how a topic's messages are read; what is no mapping of them, as None, is left to others to judge. The
+    step is that of all nodes, as any source says it; else as the settings have it.
     """
     sources, step = settings.sources, settings.options.step
     if not isinstance(sources, Mapping):

@@ -86,7 +86,7 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])
     corner[-1, -1] = 1.0
-    # m columns, of zeros where the covariance has fewer.
+    # `corner` is where a spread has the covariance of n. Of the m columns some are zero if the covariance has fewer.
     noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
     return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
 

@@ -76,13 +76,13 @@ class Flips(AbstractRandomAffine):
         return BitFlips(self.error, self.dimension, self.per_message, bits, beside)
 
     def moments(self, order: int) -> JointMoments:
-        """Refuse: what a flipped bit does depends on the words."""
+        """Refuse moments: what a flipped bit does to a word depends on the word, which only the encoder knows."""
         raise fail(
             "channel of words", "a filter that is given the encoder of the words (encoder=...)", "one that is not"
         )
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Refuse: what a flipped bit does depends on the words."""
+        """Refuse to draw: what a flipped bit does to a word depends on the word, which only the encoder knows."""
         raise fail("channel of words", "a node that has the encoder of the words (encoder=...)", "one that has none")
 
     def in_words(self) -> str:

@@ -100,7 +100,8 @@ class RoundedNoise(AbstractNoise):
     def is_exact(self) -> bool:
         """True if Var e, of the rounding's error e, is known, and e has mean 0 whatever the state is.
 
-        `gaussian`: y is, so that its moments give Var e; `matters`: so does the second moment of the rounded signal.
+        By the dither; `gaussian`: y is, so that its moments give Var e; `matters`: the second moment of the rounded
+        signal enters what is claimed.
         """
         match self.dither:
             case "triangular":

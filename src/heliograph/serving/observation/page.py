@@ -146,8 +146,8 @@ def make_application(
 def _make_middleware(token: str | None, hosts: Sequence[str]) -> list[Middleware]:
     """Return what each request passes: the check of the token, and before it, where it is needed, that of the host.
 
-    The host is what a request says that it asks for: a name of this machine or one of `hosts`. The check keeps out a
-    page of elsewhere whose name was made to lead here; a token does that too, unless `hosts` are given.
+    The host is what a request says that it asks for: it must be a name of this machine, or one of `hosts`. So a page of
+    elsewhere whose name was made to lead here does not get in. With a token alone, no `hosts`, the token sees to that.
     """
     middleware = [Middleware(TokenMiddleware, token)]
     if token is None or hosts:
