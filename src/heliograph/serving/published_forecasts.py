@@ -152,7 +152,7 @@ class ForecastPublisher:
     ) -> dict[str, list[dict[str, float]]]:
         """Return {threshold: probabilities that it is crossed, by horizon}, for the states and outputs of a filter.
 
-        None for a filter that claims no covariance. `place`: its node and name.
+        {} for a filter that claims no covariance. `place`: its node and name.
         """
         outputs = () if forecast.outputs is None else forecast.outputs.names
         known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)

@@ -39,7 +39,7 @@ Thresholds = TypeAliasType("Thresholds", tuple[Threshold, ...])
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Return the threshold that is typed as a name, a sign and a number: the state, its level, and if it is above.
+    """Return the threshold that is typed as a name, a sign and a number: a state's level, and on which side to be.
 
     Args:
         text: a name, a sign and a number, as level>30 or flow<600.
