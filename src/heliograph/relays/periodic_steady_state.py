@@ -181,11 +181,8 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect.
-
-        It is that of (x, e_relays); `side`: what the receiver sees in this slot.
-        """
-        side, gain = row
+        """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
+        side, gain = row  # `side`: the system of (x, e_relays) that the receiver sees in the slot
         corrected = correct_moments(predict(covariance, side), gain)
         return corrected, corrected
 
