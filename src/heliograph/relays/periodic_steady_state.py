@@ -172,10 +172,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
     def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take one Riccati step: return the covariance of (x, e_relays), of size d, after a slot, and the best gain.
-
-        `side`: what the receiver sees in this slot.
-        """
+        """Take a Riccati step by a slot's system `side`: return the covariance of (x, e_relays), and best gain."""
         joint = predict(covariance, side)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
