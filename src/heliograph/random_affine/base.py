@@ -55,7 +55,7 @@ class AbstractRandomAffine(Module):
     formulas = "moments", "mean_gain", "list_atoms", "extremes", "list_outcomes"
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Let a map's `moments` return the matrix alone."""
+        """Wrap the class's own `moments`, which may return the matrix alone, so that it returns `JointMoments`."""
         super().__init_subclass__(**options)
         if (written := cls.__dict__.get("moments")) is not None:
             type.__setattr__(cls, "moments", give_moments(written))
@@ -86,8 +86,8 @@ class AbstractRandomAffine(Module):
         return any(affine.remembers for affine in inner_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the state before the first draw; () where the map forgets."""
-        held = memories(self)
+        """Draw the state before the first draw; () where the map forgets: each draw is independent of the last."""
+        held = memories(self)  # of links inside, by identity
         if not held:
             return self._init(key)
         # A key for each memory, which is drawn once even where several maps inside share it, and one for the maps.
@@ -95,7 +95,7 @@ class AbstractRandomAffine(Module):
         return init_with_shared_memories(self, key_of_maps, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+        """Draw the next state, of the same structure and shapes, and H = [[G, n], [0, 1]] (outputs + 1, inputs + 1)."""
         held = memories(self)
         if not held:
             return self._draw(state, key)
@@ -104,13 +104,13 @@ class AbstractRandomAffine(Module):
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the initial state of a map that contains no modes."""
+        """Draw the initial state of a map that contains no memory; by default (), of one that forgets."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw from a map that contains no modes."""
+        """Draw the next state and H from a map that contains no memory; by default by `sample`, of one that forgets."""
         if self.remembers:
             raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         if type(self).sample is AbstractRandomAffine.sample:
@@ -118,7 +118,7 @@ class AbstractRandomAffine(Module):
         return state, self.sample(key)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw H of shape (outputs + 1, inputs + 1).
+        """Draw H = [[G, n], [0, 1]] of shape (outputs + 1, inputs + 1).
 
         Raises:
             ValueError: the map remembers, so that there is no draw without its state.
@@ -130,7 +130,9 @@ class AbstractRandomAffine(Module):
         return self.draw((), key)[1]
 
     def moments(self, order: int) -> JointMoments:
-        """Return the nominal E[Sym^order(H)] of a map that forgets; a map of your own may return the matrix alone.
+        """Return the nominal E[Sym^order(H)], which takes monomials of (y, 1) to means of those of (z, 1).
+
+        The map must forget. A map of your own may return the matrix alone.
 
         Raises:
             ValueError: the matrix would need more than the stated memory, or the map remembers: then the moments of one
@@ -156,8 +158,8 @@ class AbstractRandomAffine(Module):
     def moment_interval(self, order: int) -> Interval:
         """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
 
-        Up to CORNERS corner laws the ends are attained, since every entry is linear in each uncertain law; above, the
-        intervals of the parts are multiplied: sound but not attained.
+        Up to CORNERS corner (extreme) laws the ends are attained, since every entry is linear in each uncertain law;
+        above, or where they are not counted (None), intervals of the parts are multiplied: sound but not attained.
         """
         check_forgets("channel of a bound", self)
         corners = count_corners(self)
@@ -201,7 +203,7 @@ class AbstractRandomAffine(Module):
         return ()
 
     def carry_signal(self, signal: SignalMoment) -> SignalMoment:
-        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does.
+        """Return E (z, 1)(z, 1)' of what arrives behind the map, and the probability that it does, from those of y.
 
         Raises:
             ValueError: by default, of a map that erases: it must say itself with which probability.
@@ -227,7 +229,10 @@ class AbstractRandomAffine(Module):
         return self
 
     def list_outcomes(self) -> list["ArrivalOutcome"]:
-        """Return every set of losses of a map without memory; those of probability 0 are left out."""
+        """Return every set of losses of a map without memory: its probability, the map then, and which outputs arrive.
+
+        Those of probability 0 are left out.
+        """
         check_forgets("channel with erasures", self)
         if not self.erases:
             return [ArrivalOutcome(1.0, self, np.ones(self.outputs, dtype=bool))]
@@ -326,7 +331,7 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
-    leaves, tree = _flatten_to_inner_maps(channel)
+    leaves, tree = _flatten_to_inner_maps(channel)  # in which an inner map is a leaf
     among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
     changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
     same = all(after is before for after, before in zip(changed, leaves, strict=True))
@@ -341,7 +346,7 @@ def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util
 
 @cache_by_object
 def count_corners(channel: AbstractRandomAffine) -> int | None:
-    """Return the number of corner laws of a channel; None where they are too many to be counted."""
+    """Return the number of corner laws (extreme ones of those possible); None where they are too many to be counted."""
     try:
         return channel.corner_count()
     except ValueError:  # one law with more uncertain atoms than corners are listed for

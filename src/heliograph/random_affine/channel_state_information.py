@@ -43,7 +43,7 @@ class AbstractFreshDraw(AbstractMemory):
         return self.begin(key)
 
     def nodes(self, degree: int) -> MemoryStates:
-        """Refuse: what is told is no mode that a filter must find out.
+        """Refuse to list states: what a message tells is no hidden mode that a filter must find out.
 
         Raises:
             ValueError: always.
@@ -79,7 +79,7 @@ class FreshNumbers(AbstractFreshDraw):
         return jnp.asarray(state)
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the first numbers."""
+        """Draw the first numbers (count,) from their law; raise ValueError where nobody knows it."""
         if self.law is None:
             raise fail("simulating what a message tells", "a law of the numbers: told(..., law=...)", "none")
         return jnp.reshape(self.law.sample(key), (self.count,))
@@ -108,7 +108,7 @@ class FreshReading(AbstractFreshDraw):
         return jnp.asarray(state)[1:]
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the gain and its reading (2,)."""
+        """Draw the gain g and its reading g + e, e of the variance: (2,)."""
         gain_key, error_key = jax.random.split(key)
         gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
@@ -127,7 +127,7 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def reason_for_no_claim(self) -> str:
-        """Why no claim is made of what is told, as it is said of the numbers; "" where one is."""
+        """Why no covariance is claimed from what is told, as said of the numbers ("depends ..."); "" if one is."""
         said = ["depends on the state"] * (not self.exogenous)
         said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
         return " and ".join(said)
@@ -222,9 +222,9 @@ class ToldMap(AbstractToldMap):
         return self.make(numbers)
 
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
-        """Decide whether the map has finite numbers, and noises whose covariances are some.
+        """Decide whether the map of these numbers has finite entries only, and noises with valid covariances.
 
-        A variance of zero is one only where it is zero for typical numbers as well: elsewhere it means that nobody
+        A variance of zero is valid only where it is zero for typical numbers as well: elsewhere it means that nobody
         knows. A gain that is told decides no noise.
         """
         if isinstance(self.make, ToldGainHop):
@@ -305,7 +305,7 @@ class PilotedHop(AbstractHop, AbstractToldMap):
 
 
 def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
-    """Return the maps in a channel of which numbers are told, one for each of the memories that draw them."""
+    """Return the maps in a channel of which a message tells numbers, one for each of the memories that draw them."""
     by_identity: dict[str, AbstractToldMap] = {}
     for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map):
         if _is_told_map(leaf):
@@ -314,7 +314,7 @@ def list_told_maps(channel: AbstractRandomAffine) -> list[AbstractToldMap]:
 
 
 def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarray, "outputs told"]:
-    """Return which of the numbers told each output of a channel depends on: those of the map that it comes out of."""
+    """Return which of the numbers that a message tells each output of a channel depends on: those of its own maps."""
     identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
     rows = list[list[bool]]()
     for part in channel.in_parallel:
@@ -333,7 +333,7 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
     parts = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
-        """Return a map as its receiver knows it given its numbers, anything else as it is."""
+        """Return a map as its receiver knows it given its numbers (`parts`, by memory), anything else as it is."""
         return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
@@ -341,7 +341,7 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
 
 
 def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Array:
-    """Decide whether what is told of each of the channel's maps gives a law.
+    """Decide whether what is told of each of the channel's maps gives a law: finite numbers, sound covariances.
 
     Args:
         channel: a channel.
@@ -352,7 +352,7 @@ def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Arr
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
-    """Return what is told of each map of a channel, by the identity of its memory."""
+    """Return the numbers told of each map of a channel, which stand one after another, by its memory's identity."""
     assert isinstance(channel, AbstractRandomAffine)
     parts, start = dict[str, Numbers](), 0
     for affine in list_told_maps(channel):
@@ -368,23 +368,23 @@ def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.n
 
 
 def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarray) -> jax.Array:
-    """Decide whether L diag(d) L' with d not negative is the matrix, to rounding, and its variances are not lost."""
+    """Decide whether a matrix is a covariance to rounding, with variances of 0 only where `typical` has them too."""
     lower, pivots = eliminate(jnp.asarray(matrix))
     variances = jnp.diagonal(jnp.asarray(matrix))
     positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
-    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)
+    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)  # 0 if L diag(d) L', d >= 0
     return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 
 def make_laws_certain(link: T) -> T:
-    """Return a link whose laws of finitely many gains or modes are certain, whatever traces their numbers.
+    """Return a link whose laws of finitely many gains or modes count as certain, even where their numbers are traced.
 
     Raises:
         ValueError: probabilities that may be off.
     """
 
     def certain(leaf: object) -> object:
-        """Return a law of finitely many gains, or a map of modes, as one whose probabilities are certain."""
+        """Return a law of finitely many gains, or a map of modes, as one of certain probabilities; else the leaf."""
         if isinstance(leaf, Discrete):
             return CertainDiscrete(leaf)
         if isinstance(leaf, AbstractModal) and isinstance(leaf.memory, MarkovChain):

@@ -76,7 +76,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return self.maps[0].inputs
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the angles of every map: all choices must agree."""
+        """Return which outputs are angles, if the inputs `sent` are: one of `maps` is in force, so all must agree."""
         results = {affine.carry_angles(sent) for affine in self.maps}
         if len(results) > 1:
             raise refuse_gain_on_angles(type(self).__name__)
@@ -85,6 +85,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map with `visit` applied to each hop of each of its maps, and the position behind the longest.
 
+        A hop is a transmitter with its link; the position counts those before it.
         All maps begin at `position`: hops at equal places are the same transmitters in each of them.
         """
         pairs = [affine.visit_hops(visit, position) for affine in self.maps]
@@ -92,7 +93,7 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         return visited, max((after for _, after in pairs), key=lambda after: after.hops)
 
     def check_shapes(self, name: str) -> None:
-        """Raise ValueError where the maps have several shapes."""
+        """Raise ValueError, with the `name` of what has these maps, where they have several shapes."""
         shapes = [(m.outputs, m.inputs) for m in self.maps]
         if len(set(shapes)) != 1:
             raise fail(name, "maps of one shape", shapes)

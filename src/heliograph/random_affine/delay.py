@@ -75,6 +75,7 @@ class DelayLine(AbstractDelayLine):
 
     def __init__(self, link: AbstractRandomAffine, past: int):
         check_maps("link", [link])
+        # The link takes a line of 1 + past signals: the present one and past ones.
         self.link, self.steps = link, check_count("past", past)
         if link.inputs % (1 + past):
             raise fail("link", f"inputs of {1 + past} signals of one length", link.inputs)
@@ -139,7 +140,10 @@ class DelayedLink(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """The map from the line of past signals to what arrives: the choice of one, then the link."""
+        """The map from the line of past signals to what arrives: `delay`, which chooses one, then the link.
+
+        If time stamped, the chosen delay comes as one number more, which goes round the link.
+        """
         if not self.timestamped:
             return Series([self.delay, self.link])
         m = self.link.inputs
@@ -180,7 +184,7 @@ class DelayedLink(AbstractDelayLine):
 
 
 def _list_delays(delay: Delay) -> tuple[int, ...]:
-    """Return the possible delays in steps; ValueError of what is no delay."""
+    """Return the possible delays in steps; ValueError of what is no delay. A chain's mode is the number of steps."""
     match delay:
         case Discrete():
             values = [int(d) if d == int(d) else float(d) for d in np.asarray(delay.values)]
@@ -194,7 +198,10 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
 
 
 def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
-    """Return S_d, which selects the signal of d steps ago from the line, and below it the number d if time stamped."""
+    """Return S_d, which selects the signal of d steps ago from the delay line, the last `longest` + 1 signals in turn.
+
+    If time stamped, the number d stands below the signal. `size`: length of a signal.
+    """
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
         return known(rows)
@@ -202,7 +209,10 @@ def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) ->
 
 
 def place_on_delay_line(channel: T) -> T:
-    """Return the channel, or a tree in which each channel with delays is the same map of the line without delay."""
+    """Return the channel, or a tree of channels, with each one that delays as a map without delay of the delay line.
+
+    The line is (y_k, y_{k-1}, ...), the present signal and past ones.
+    """
 
     def take_line(leaf: object) -> object:
         """Return the map of the line of a channel with delays; anything else as it is."""
@@ -218,11 +228,12 @@ def signal_size(channel: AbstractRandomAffine) -> int:
 
 
 def place_channel_of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
-    """Return a channel of y[start:start + size] as one of all of y (total,), and of a line of `past` steps.
+    """Return a channel of y[start:start + size] as one of all of y (total,), and of a delay line of `past` steps.
 
-    The line is at least as long as the channel's own.
+    The line (y_k, y_{k-1}, ...) is at least as long as the channel's own.
     """
     longest, size = channel.past, signal_size(channel)
+    # The rows of the line that the channel takes: its part of each signal, present and past.
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
     chosen = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
     return DelayLine(chosen, past) if past else chosen
@@ -264,7 +275,10 @@ class RelayStorage(AbstractMapWrapper):
         return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw the present reception; return H of all stored ones, the newest first, and those to be stored."""
+        """Draw the present reception; return the state, and H of it and all stored ones, the newest first.
+
+        The state: that of `base`, the link, and the `steps` receptions (gain and noise as drawn) that are stored.
+        """
         inner, before = state
         inner, h = self.base.draw(inner, key)
         # Each reception takes its own part of the line: that of t steps ago begins t signals later.
@@ -289,7 +303,10 @@ class RelayedLinks(AbstractDelayLine):
 
     @property
     def line(self) -> AbstractRandomAffine:
-        """Return the stages in series, each fed by the storage of the one before."""
+        """Return the stages in series as a map of the line of past signals, each fed by the storage of the one before.
+
+        A stage that delays takes past outputs of the one before, which are therefore stored for `past` steps.
+        """
         size, whole = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
             whole = Series([RelayStorage(whole, size, stage.past), place_on_delay_line(stage)])
@@ -365,7 +382,10 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
 
 
 def _lengthen_delay(link: DelayedLink, more: int) -> Delay:
-    """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps."""
+    """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps.
+
+    The link holds a random delay as a choice or as modes of maps; `times` are the possible delays.
+    """
     match link.delay:
         case Mixture():
             times = np.array(link.times, dtype=float) + more

@@ -31,7 +31,7 @@ class Erasure(AbstractMapWrapper):
         return True
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw whether it arrives, and the map, whose state moves in any case."""
+        """Draw whether it arrives, and the map, whose state moves in any case; all of a lost one is NaN."""
         arrives, drawn = jax.random.split(key)
         state, h = self.base.draw(state, drawn)
         lost = ~jax.random.bernoulli(arrives, self.arrival)
@@ -42,7 +42,10 @@ class Erasure(AbstractMapWrapper):
         return self.base.condition_on_arrival()
 
     def _outcomes(self) -> list[ArrivalOutcome]:
-        """Return the two outcomes: what the map delivers, or nothing."""
+        """Return the outcomes: each of the map's own with the probability that it arrives; and that nothing does.
+
+        An outcome: its probability, the map then, and which outputs arrive.
+        """
         arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
         listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
         return [*listed, ArrivalOutcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
@@ -73,7 +76,10 @@ class Erasure(AbstractMapWrapper):
 def second_moments(
     channel: AbstractRandomAffine,
 ) -> tuple[Float[np.ndarray, "m p+1"], Float[np.ndarray, "m m p+1 p+1"]]:
-    """Return E[(G, n)] and the tensor of E[z z' | y] on (y, 1)(y, 1)', under the nominal law."""
+    """Return E[(G, n)] of z = G y + n, and the tensor T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1).
+
+    Under the nominal law.
+    """
     moments = channel.moments(2)
     tensor = moments.second
     return np.asarray(moments.mean[:-1]), np.asarray(tensor)

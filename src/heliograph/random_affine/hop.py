@@ -57,7 +57,7 @@ class AbstractHop(AbstractRandomAffine):
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit a hop that transmits, as the next along its chain."""
+        """Return visit(name, hop, signal) in place of a hop that transmits, and the position behind it."""
         if not self.transmits:
             return self, position
         after = position._replace(hops=position.hops + 1)
@@ -91,7 +91,7 @@ class GainAndNoise(AbstractHop):
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw [[g A, n], [0, 1]]."""
+        """Draw H = [[g A, n], [0, 1]] of z = g A y + n: a random gain g and a noise n."""
         gain_key, noise_key = jax.random.split(key)
         top = jnp.concatenate(
             [self.law.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],
@@ -106,14 +106,17 @@ class GainAndNoise(AbstractHop):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return sum_k E[g^k] B_k, with B_k the `gain_coefficients`."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`."""
         gains = tabulate_gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
         return JointMoments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
     @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
-        """Return B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], |b| = k."""
+        """Return B_k, the coefficients of E[g^k] in the moments of this order: by k, monomials of (z, 1) and of (y, 1).
+
+        E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)]: B_k has the terms |b| = k.
+        """
         rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         deterministic = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
@@ -130,13 +133,16 @@ class GainAndNoise(AbstractHop):
         return len(self.law.corner_moments(0))
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
-        """Return the moments with E[g^k] of each extreme law."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner: an extreme law of the gain g that is possible."""
         gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
         return moment_map
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Sum the known B_k with the exact range of each E[g^k], from the closed-form LP of a discrete law."""
+        """Return the ends of each entry of sum_k E[g^k] B_k, with the exact range of each E[g^k] over the laws of g.
+
+        B_k, the `gain_coefficients`, are known; where an entry is negative the lower moment gives the higher product.
+        """
         basis, xp = self.gain_coefficients(order), library(self.gain_coefficients(order))
         ends = [self.law.moment_interval(k) for k in range(order + 1)]
         lows, highs = [], []
@@ -146,13 +152,13 @@ class GainAndNoise(AbstractHop):
         return sum(lows), sum(highs)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a hop of this matrix and noise whose law of the gain is covered by this one's."""
+        """Return whether `own` is a hop of this matrix and noise whose law of the gain is among those possible here."""
         if not isinstance(own, GainAndNoise) or not self.law.covers(own.law):
             return False
         return equal_to_rounding(self.matrix, own.matrix) and same_noise(self.noise, own.noise)
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
-        """Return the outputs that take nothing but known inputs, by a constant gain."""
+        """Return which outputs have a known gain: those that take nothing but `known` inputs, by a constant gain."""
         takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
         rows: KnownGains = (self.law.constant is not None) & ~np.any(takes & ~known, axis=1)
         return rows
@@ -206,7 +212,10 @@ class GainAndNoise(AbstractHop):
         return f"{kind} {gain:.3g}" if is_multiple_of_identity and gain != 1 else kind
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Take the noise away where its law has outliers."""
+        """Return the hop without its noise, of which the mean stays, and the noise, if its law has outliers.
+
+        Else the hop as it is, and None.
+        """
         if not self.noise.has_outliers:
             return self, None
         mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)

@@ -106,7 +106,7 @@ class AbstractMemory(Module):
         raise unwritten(self, "next_state_quadrature")
 
     def labelled(self, label: str) -> "AbstractMemory":
-        """Return a copy that no link refers to yet, identified by `label` alone."""
+        """Return a copy that no link refers to yet, without a name, identified by `label` alone."""
         twin = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(twin, "name", None)
         object.__setattr__(twin, "identity", label)
@@ -166,7 +166,10 @@ class MarkovChain(AbstractMemory):
         return bool(np.any(self.radius > 0))
 
     def covers(self, own: "MarkovChain") -> bool:
-        """Decide whether another chain is this memory, its transition within the radius."""
+        """Decide whether another chain is this memory, and all its possible transitions are among this one's.
+
+        The radius is how far each probability of a transition may be off.
+        """
         if own.identity != self.identity or not equal_to_rounding(self.initial, own.initial):
             return False
         return within(own.transition, own.radius, self.transition, self.radius)
@@ -254,6 +257,7 @@ class Autoregression(AbstractMemory):
     def nodes(self, degree: int) -> MemoryStates:
         """Return Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
 
+        The state c+ = rho c + sqrt(1 - rho^2) e is standard normal, L_j the Lagrange polynomial that is 1 at x_j only.
         With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
         the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
         this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
@@ -267,7 +271,10 @@ class Autoregression(AbstractMemory):
         return number
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Return rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
+        """Return next states and their weights: rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x, from the state c.
+
+        Without one, at the first use, x itself: the state is standard normal.
+        """
         x, w, _ = _hermite_quadrature(degree + 1)
         rho = jnp.asarray(self.correlation)
         return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
@@ -275,7 +282,8 @@ class Autoregression(AbstractMemory):
     def chain(self, modes: int) -> MemoryStates:
         """Return a chain with the same mean, variance and correlation, without negative entries.
 
-        Its states are binomial nodes, and E[c+ | c] = rho c.
+        Its states, n + 1 = `modes` of them, are those of a count of n fair coins, centred and scaled to variance 1. At
+        each step every coin stays with probability (1 + rho) / 2 or turns, so E[c+ | c] = rho c.
 
         Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
         """
@@ -297,6 +305,7 @@ def find_stationary_law(transition: Rows) -> Law:
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
         raise fail("initial law", "one, since the chain has several stationary laws", "none")
+    # p (Pi - I) = 0, of which one row follows from the others; in its place the sum of p is 1.
     balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
     law = xp.linalg.solve(balance, np.eye(m)[-1])
     normalised: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
@@ -304,14 +313,14 @@ def find_stationary_law(transition: Rows) -> Law:
 
 
 def identify_memory(name: str | None) -> str:
-    """Return a text that identifies a memory, through copies and in other processes; no draw depends on it."""
+    """Return a text that identifies a memory: its name's, else one of its own, which copies keep; no draw needs it."""
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a memory", "a text", repr(name))
     return uuid4().hex if name is None else f"named {name}"
 
 
 def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-    """Return the probabilities of 0, ..., n successes."""
+    """Return the probabilities (n + 1,) of 0, ..., n successes in n trials, each with the probability p."""
     k = np.arange(n + 1)
     ways = np.array([comb(n, i) for i in k], dtype=float)
     binomial: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
@@ -320,14 +329,21 @@ def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Ar
 
 @cache_arrays
 def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
+    """Return Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count.
+
+    Of the standard normal law: the weights sum to 1, and E[h_m h_n] is 1 for m = n, else 0.
+    """
     x, w = hermegauss(count)
     scale = np.sqrt([float(factorial(m)) for m in range(count)])
     return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale
 
 
 def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Return the memories without repetition, told apart by their labels, in order of appearance."""
+    """Return the memories by identity, each once, in order of appearance.
+
+    Raises:
+        ValueError: memories of one identity (of one name) that differ.
+    """
     results: dict[str, AbstractMemory] = {}
     for memory in held:
         known = results.setdefault(memory.identity, memory)

@@ -26,7 +26,10 @@ class AbstractWithMemory(Module):
 
 
 def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T | None:
-    """Return the model of a traced mode, with its numbers, of models that differ in numbers alone; else None."""
+    """Return the model of a mode, with its numbers, of models (one a mode) that differ in numbers alone; else None.
+
+    `state`: the number of the mode, which is traced by JAX, so that no model can be chosen by it: its numbers are.
+    """
     leaves, trees = zip(*(jax.tree.flatten(model) for model in models), strict=True)
     if any(not eqx.is_array_like(leaf) for of_mode in leaves for leaf in of_mode):
         return None
@@ -54,7 +57,10 @@ def init_with_shared_memories(channel: Any, key: jax.Array, keys: Sequence[jax.A
 def draw_with_shared_memories(
     channel: Any, state: ChannelState, key: jax.Array, keys: Sequence[jax.Array]
 ) -> tuple[ChannelState, jax.Array]:
-    """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H."""
+    """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H.
+
+    The state: those of all memories in a channel, and the `rest`, that of the channel given these.
+    """
     rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
     held = memories(channel).values()
     return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
@@ -78,7 +84,7 @@ def condition_on_states(channel: T, by_identity: Mapping[str, int | float | jax.
     """
 
     def condition(leaf: PyTree) -> PyTree:
-        """Return a map with a memory as it is in the memory's state, anything else as it is."""
+        """Return a map with a memory as that of the memory's state (`by_identity`), anything else as it is."""
         return leaf.given(by_identity[leaf.memory.identity]) if is_memory_dependent(leaf) else leaf
 
     memoryless: T = jax.tree.map(condition, channel, is_leaf=is_memory_dependent)
@@ -97,14 +103,20 @@ def drop_names(channel: T) -> T:
 
 
 def number_unnamed_memories(model: T) -> T:
-    """Return the model with its unnamed memories called by their number: models that differ in these look alike."""
+    """Return the model with its unnamed memories identified by their number, in place of random texts.
+
+    So models that differ in these texts alone look alike.
+    """
     held = enumerate(memories(model).items())
     twins = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in held if memory.name is None}
     return replace_memories(model, twins)
 
 
 def separate_memories(maps: Sequence[T]) -> list[T]:
-    """Return maps that share no unnamed memory: one that stands in several of them becomes one of each."""
+    """Return maps that share no unnamed memory: one that stands in several of them becomes one of each.
+
+    Named memories stay shared. The first map keeps its memories; later ones get copies, labelled by their index.
+    """
     separate, taken = [], set[str]()
     for index, affine in enumerate(maps):
         held = memories(affine)
@@ -115,7 +127,10 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of later steps with the unnamed memories of the first step, in order of appearance."""
+    """Return the maps of all steps, with unnamed memories identified as the first step's, by order of appearance.
+
+    So they go on from step to step. Maps as they are where the first has no memory, or steps have different counts.
+    """
     by_map = [memories(affine) for affine in maps]
     if not by_map[0] or len({len(held) for held in by_map}) > 1:
         return list(maps)
@@ -127,10 +142,10 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
 
 def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
-    """Return the map with other memories in place of those of these identities."""
+    """Return the map with other memories in place of its own; `twins`: the other memory by the identity of its own."""
 
     def replace(leaf: PyTree) -> PyTree:
-        """Return a map with a memory with the other memory in its place, anything else as it is."""
+        """Return a map with the other memory (`twins`, by identity) in place of its own, anything else as it is."""
         if not is_memory_dependent(leaf) or leaf.memory.identity not in twins:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])

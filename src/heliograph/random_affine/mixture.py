@@ -45,14 +45,14 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         self.check_shapes("mixture")
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw which map, and every map."""
+        """Draw every map, and which of them is in force; all states move. Returns the next state and H."""
         choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
         state, drawn = self._draw_each(state, keys)
         return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return sum_i p_i E[Sym^k(H_i)]."""
+        """Return sum_i p_i E[Sym^order(H_i)], p_i the probability of map i."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
         matrix = library(parts, self.choice.probabilities).tensordot(
@@ -61,8 +61,11 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the extreme weights combined with the extremes of each map: the law is linear in either."""
-        # Extreme laws of weights are weights; what else a choice names has none of its own.
+        """Return mixtures of the extreme weights with the extreme laws of each map: the law is linear in either.
+
+        So every law that is possible lies between these.
+        """
+        # The extreme laws of the choice, all of which are Discrete.
         corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
         return tuple(
             Mixture(parts, law.probabilities)
@@ -72,10 +75,11 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return the corners of the weights, with every combination of the maps' corners."""
+        """Return E[Sym^order(H)] at each corner: each extreme law of the weights with each combination of the maps'."""
         parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
         chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
         combined = stack_parts([corners[which] for corners, which in zip(parts, chosen, strict=True)])
+        # By corner of the weights, combination, row and column; then by corner of the mixture, row and column.
         items = library(weights, combined).tensordot(weights, combined, axes=1)
         flat: Matrix = items.reshape(-1, *items.shape[2:])
         return flat
@@ -99,7 +103,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return mix_gains(parts, np.asarray(self.choice.probabilities), self.inputs)
 
     def in_words(self) -> str:
-        """Return the maps in words, with their shares; of a map and silence, a loss that nobody notices."""
+        """Return the maps in words, with their shares; a choice of a map or silence is a loss that nobody notices."""
         parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
         if len(parts) == 2 and parts[1] == NOTHING_SENT:
             return f"{parts[0]}, {write_percentage(shares[1])} lost unnoticed"
@@ -107,14 +111,18 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit each map as a choice with transmitters of its own; a hop and its loss are one."""
+        """Visit the hops of each map as a choice with transmitters of its own; return the new map, and the position.
+
+        Where all maps but one deliver noise alone, as a hop or its loss, they are no such choice: the hop is one
+        transmitter of the chain.
+        """
         if sum(not affine.is_silent for affine in self.maps) <= 1:
             return super().visit_hops(visit, position)
         visited = [affine.visit_hops(visit, at)[0] for affine, at in position.number_maps(self.maps, "choice")]
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
+        """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
         moments = self.moments(2)
         mean = moments.mean
         second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1

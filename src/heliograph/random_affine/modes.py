@@ -60,14 +60,17 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
             check_forgets("map of a mode", m)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of this mode; for a traced mode, one with its numbers, or a choice among kinds of maps."""
+        """Return the map of this mode; of a mode traced by JAX one map with its numbers, or else a choice among all.
+
+        One map where the modes' maps differ in numbers alone.
+        """
         if isinstance(state, int | np.integer):
             return self.maps[state]
         present = select_model_of_equal_structure(self.maps, jnp.asarray(state))
         return _MapOfTracedIndex(self.maps, jnp.asarray(state)) if present is None else present
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is of modes whose chain this one's covers, with maps that are covered one by one."""
+        """Return whether `own` is possible under this map: of modes whose chain and maps are, one by one."""
         if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
             return False
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
@@ -142,7 +145,10 @@ class OneStepLate(AbstractMapWrapper):
         return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Return what was drawn at the step before, and draw what the next step receives."""
+        """Return the state and H as drawn at the step before, and draw what the next step receives.
+
+        State: that of the map `base`, and the rows [G, n] that it drew last.
+        """
         inner, before = state
         inner, h = self.base.draw(inner, key)
         return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
@@ -278,7 +284,10 @@ def joint_modes(
 
 
 def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
-    """Return a memory as finitely many states, as many as its degree in the channel asks for."""
+    """Return a memory as finitely many states: `nodes` of them where a drifting fading is given so many.
+
+    Else as many as the degree of polynomials in its state, which the channel needs, asks for.
+    """
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
     return memory.nodes(degree)
@@ -289,7 +298,7 @@ DOUBLINGS = 60  # of the steps after which the law of the modes is that of the l
 
 
 def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffine:
-    """Return the channel with its modes drawn anew at each step, by their law in the long run.
+    """Return the channel with its modes drawn anew at each step, by their law in the long run: without memory.
 
     A channel without memory is itself.
     """
@@ -305,16 +314,20 @@ def mix_maps_of_modes(modes: JointModes, law: np.ndarray | None = None) -> Abstr
 
 
 def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
-    """Return the mean of the laws of all steps, of a chain that goes in circles too: p ((I + Pi) / 2)^n, n large."""
+    """Return the mean of the laws of all steps, of a chain that goes in circles too: p ((I + Pi) / 2)^n, n large.
+
+    p: `initial`; Pi: `chain`, the transitions; n = 2^DOUBLINGS. Staying with probability 1/2 ends circles and keeps the
+    mean.
+    """
     rows = (np.eye(len(chain)) + chain) / 2
     for _ in range(DOUBLINGS):
-        rows = rows @ rows
+        rows = rows @ rows  # n doubles
         rows = rows / rows.sum(axis=1, keepdims=True)
     return np.asarray(initial @ rows)
 
 
 def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
-    """Return the probabilities of the modes at each step."""
+    """Return the probabilities of the modes at each step, from the first law and each step's transitions."""
     over_steps = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
         over_steps.append(over_steps[-1] @ np.asarray(step.transition))

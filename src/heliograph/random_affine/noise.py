@@ -145,7 +145,7 @@ class Gaussian(AbstractNoise):
         return [NoiseAtom(1.0, self.mean, self.covariance)]
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the blocks of the covariance, where nothing stands between them."""
+        """Return the noise of each group of components, or None where two groups are correlated."""
         label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         if np.any(np.asarray(self.covariance)[label[:, None] != label]):
             return None
@@ -162,7 +162,7 @@ class Gaussian(AbstractNoise):
 
         @cache
         def expectation(a: Exponents) -> Number:
-            """Return E[n^a], with n_i taken out of n^a = n_i g(n)."""
+            """Return E[n^a] of Gaussian n: with n^a = n_i g(n) it is m_i E[g] + sum_j S_ij E[dg/dn_j]."""
             if sum(a) == 0:
                 return 1.0
             i = next(index for index, power in enumerate(a) if power)
@@ -253,7 +253,7 @@ class Independent(AbstractNoise):
 
     @property
     def columns(self) -> WeightedColumns:
-        """Those of the parts, one after another."""
+        """Columns A and weights w with covariance A diag(w) A': those of the parts, one after another."""
         parts = [component.columns for component in self.parts]
         matrices = [part.matrix for part in parts]
         weights = library(parts).concatenate([part.weights for part in parts])
@@ -274,7 +274,7 @@ class Independent(AbstractNoise):
         return stack_branches([component.branches() for component in self.parts])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return mean and covariance of the parts without their outliers, one above the other and uncorrelated."""
+        """Return mean and covariance of the independent parts without their outliers, one above the other."""
         parts = [component.without_outliers() for component in self.parts]
         mean = library(parts).concatenate([part.mean for part in parts])
         return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))
@@ -284,7 +284,7 @@ class Independent(AbstractNoise):
         return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the parts of each group, where no part is of two."""
+        """Return the noise of each group of components, of the parts that it takes; None where one is of two groups."""
         owners = np.repeat(np.arange(len(self.parts)), [component.dimension for component in self.parts])
         owned = [[self.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
         apart = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
@@ -296,13 +296,13 @@ class Independent(AbstractNoise):
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 
     def report(self, y: jax.Array) -> jax.Array:
-        """Return what each part reports of its components."""
+        """Return what each part reports (as rounded values) of its components of a measurement y."""
         ends = np.cumsum([component.dimension for component in self.parts])[:-1]
         pieces = zip(self.parts, jnp.split(y, ends), strict=True)
         return jnp.concatenate([component.report(piece) for component, piece in pieces])
 
     def moment(self, powers: Exponents) -> Number:
-        """Return prod_parts E[n_part^a_part]."""
+        """Return E[n^a], the product of E[n_part^a_part] over the independent parts; `powers`: a, by component."""
         value: Number = 1.0
         start = 0
         for component in self.parts:
@@ -347,7 +347,7 @@ class Shaped(AbstractNoise):
         return jnp.asarray(self.matrix) @ self.source.sample(key)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[prod_i (sum_j B_ij u_j)^a_i], a polynomial in u whose terms' moments are the source's."""
+        """Return E[n^a] = E[prod_i (sum_j B_ij u_j)^a_i]: of a polynomial in u, the source, term by term."""
         polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
         for i, power in enumerate(powers):
             for _ in range(power):
@@ -357,7 +357,7 @@ class Shaped(AbstractNoise):
 
 
 def _multiply_by_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
-    """Return the coefficients of p(u) sum_j row_j u_j."""
+    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
     product: dict[Exponents, Number] = {}
     used = [j for j, entry in enumerate(row) if not is_zero(entry)]
     for a, c in polynomial.items():
@@ -383,7 +383,7 @@ def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
 
 
 def count_components(value: NoiseLike) -> int | None:
-    """Count the components of a noise law or covariance; None for a number, which is a variance alone."""
+    """Count the components of a noise law or covariance; None for a number, a variance of any component."""
     if isinstance(value, AbstractNoise):
         return value.dimension
     try:

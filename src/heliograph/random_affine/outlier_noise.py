@@ -49,7 +49,7 @@ class StudentT(AbstractNoise):
 
     @property  # type: ignore[misc]
     def covariance(self) -> Square:  # type: ignore[override]
-        """Covariance of the noise: the scale times nu / (nu - 2).
+        """Covariance of the noise: the scale times nu / (nu - 2), nu its degrees of freedom.
 
         Raises:
             ValueError: at most 2 degrees.
@@ -72,7 +72,10 @@ class StudentT(AbstractNoise):
         return True
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches, one for each of the PRECISIONS."""
+        """Return Student's law of each component as a mixture of Gaussian branches, one for each of the PRECISIONS l.
+
+        By component and branch: logarithm of the probability, mean (0) and variance, the scale's divided by l.
+        """
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
         shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
@@ -83,7 +86,7 @@ class StudentT(AbstractNoise):
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw A w / sqrt(l), w standard normal."""
+        """Draw Gaussian noise of the scale divided by sqrt(l), l of the gamma law of mean 1: Student's noise."""
         first, second = jax.random.split(key)
         half = jnp.asarray(self.degrees, dtype=float) / 2
         precision = jax.random.gamma(second, half, dtype=float) / half
@@ -91,6 +94,8 @@ class StudentT(AbstractNoise):
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
+
+        The noise is Gaussian noise divided by sqrt(l), l chi-squared of nu degrees divided by nu. Odd moments are 0.
 
         Raises:
             ValueError: an order of at least `degrees`, whose moment does not exist.
@@ -170,6 +175,7 @@ class Contaminated(AbstractNoise):
         xp = library(factor, inlier, share)
         units = xp.broadcast_to(factor, (n,))
         slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
+        # A slice adds its mean to the noise, and its variance along `units` to the covariance.
         spreads = [inlier + v * xp.outer(units, units) for v in variance]
         return cls(inlier, xp.stack([slice_share] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
 
@@ -177,7 +183,8 @@ class Contaminated(AbstractNoise):
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
         """Return zero-mean noise known by bounds: at most this share of outliers, E[o o'] at most this matrix.
 
-        (1 - e) R + e G dominates the covariance for every share up to e, since G >= R.
+        R: `covariance` of the noise without outliers; G: `outlier_second_moment`; e: `share`. (1 - e) R + e G dominates
+        the covariance for every share up to e, since G >= R.
 
         Raises:
             ValueError: as for the class; a second moment of outliers that does not dominate the covariance.
@@ -202,7 +209,10 @@ class Contaminated(AbstractNoise):
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches about the mean, those of the law."""
+        """Return each component as a mixture of Gaussian branches about the noise's mean: without and with outliers.
+
+        By component and branch: logarithm of the probability, mean and variance.
+        """
         xp, n = library(self.shares), self.dimension
         shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
@@ -213,7 +223,7 @@ class Contaminated(AbstractNoise):
         return NoiseWithoutOutliers(self.means[0] - self.mean, self.covariances[0])
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the branch by the shares, then the noise from it."""
+        """Draw the branch, without or with outliers, by the shares; return the noise of its Gaussian law."""
         first, second = jax.random.split(key)
         branch = draw_index(self.shares, first)
         laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
@@ -226,7 +236,11 @@ class Contaminated(AbstractNoise):
 
 
 def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
-    """Return the gamma law's mass of l between geometric means of neighbouring PRECISIONS, at least LEAST_SHARE."""
+    """Return the share of each of the PRECISIONS, at least LEAST_SHARE, in Student's law as a mixture of Gaussian ones.
+
+    The precision l has the gamma law of mean 1, chi-squared of the degrees divided by these. A share is the mass of l
+    between the geometric means of neighbouring PRECISIONS.
+    """
     xp: Any = library(degrees)
     half = xp.asarray(degrees) / 2
     between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
@@ -238,7 +252,10 @@ def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
 
 
 def has_bounded_noise(*parts: PyTree) -> bool:
-    """Return whether some noise in these parts of a network is known by a bound of its covariance alone."""
+    """Return whether some noise in these parts of a network is known by a bound of its covariance alone.
+
+    Only contaminated noise can be: of at most a share of outliers.
+    """
 
     def is_law(leaf: object) -> bool:
         """Return whether a leaf is a noise law that may be a bound."""
@@ -265,7 +282,10 @@ def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
 
 
 def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> list[ArrayLike]:
-    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many."""
+    """Return one mean or covariance for each kind of outlier; raise ValueError where there are not as many.
+
+    `several`: whether a list of kinds was given. Then a number (rank 0) is that of every kind.
+    """
     if not several:
         return [value]
     if not rank(name, value):
@@ -277,11 +297,11 @@ def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> li
 
 
 def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and variance of the exponential law of mean 1 between its quantiles k / count.
+    """Return the mean and variance, in each of `count` slices of equal probability, of the exponential law of mean 1.
 
-    With the survival S from 1 down to 0 and t = -log S: int t dS and int t^2 dS by parts.
+    With the survival S from 1 down to 0 and t = -log S: the integrals of t and t^2 over a slice of S, times count.
     """
-    survival = 1 - np.arange(count + 1) / count
+    survival = 1 - np.arange(count + 1) / count  # at the slices' ends; at 0 the logarithm is multiplied by 0
     time = -np.log(np.where(survival > 0, survival, 1.0))
     first = count * -np.diff(survival * (time + 1))
     second = count * -np.diff(survival * (time**2 + 2 * time + 2))
@@ -289,7 +309,7 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:
-    """Return the logarithms, -inf of zero without a warning."""
+    """Return the logarithms, -inf of zero without a warning, of NumPy or JAX (traced) numbers."""
     if is_traced(value):
         return jnp.log(value)
     with np.errstate(divide="ignore"):

@@ -46,14 +46,18 @@ class Rotation(AbstractRandomAffine):
         return 2
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the rotation by phi."""
+        """Draw H = [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]] of a random angle phi, normal of this deviation."""
         phi = self.deviation * jax.random.normal(key, dtype=float)
         c, s = jnp.cos(phi), jnp.sin(phi)
         return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), C the map to w and its conjugate."""
+        """Return E[Sym^k(H)] = Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), k = `order`.
+
+        C takes (y_1, y_2) to w = y_1 + i y_2 and its conjugate v: w^p v^q turns by (p - q) phi, of which that is the
+        mean factor.
+        """
         turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)
         there, back = (symmetric_power(matrix, order) for matrix in (TO_COMPLEX, np.linalg.inv(TO_COMPLEX)))

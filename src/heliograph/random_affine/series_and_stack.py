@@ -66,7 +66,7 @@ class AbstractCombination(AbstractComposite):
         return max(affine.degree_in(identity) for affine in self.maps)
 
     def covers_maps(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Decide whether another map is of this kind and each of its maps covered by that of this one."""
+        """Decide whether another map is of this kind, and each of its maps is possible under that of this one."""
         if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
             return False
         return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
@@ -74,7 +74,10 @@ class AbstractCombination(AbstractComposite):
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
-        """Return the next state and one H of each map."""
+        """Draw each map by its key: return the next state, and H of each.
+
+        The state is the tuple of the maps' states; () where all of them forget.
+        """
         states = state if self.remembers else ((),) * len(self.maps)
         pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
         return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
@@ -85,7 +88,10 @@ def _join_outcomes(
     b: list[ArrivalOutcome],
     join: Callable[[ArrivalOutcome, ArrivalOutcome], tuple[AbstractRandomAffine, np.ndarray]],
 ) -> list[ArrivalOutcome]:
-    """Return the sets of losses of two independent parts together; join(x, y) gives the map and what arrives."""
+    """Return each set of losses of a with each of b, two independent parts, with the product of their probabilities.
+
+    join(x, y) gives the map of both then, and which of its outputs arrive.
+    """
     if len(a) * len(b) > OUTCOME_LIMIT:
         raise fail("channel with erasures", f"at most {OUTCOME_LIMIT} sets of losses", f"{len(a) * len(b):,}")
     return [ArrivalOutcome(x.probability * y.probability, *join(x, y)) for x in a for y in b]
@@ -112,14 +118,17 @@ class Series(AbstractCombination):
         return self.maps[-1].outputs
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map, and multiply, the first map's matrix rightmost; rows of lost outputs are NaN."""
+        """Return the next state, and H of the series: each map's drawn and multiplied, the first map's rightmost.
+
+        Rows of lost outputs are NaN.
+        """
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         then = _compose_draws if self.erases else jnp.matmul
         return state, reduce(lambda h, matrix: then(matrix, h), drawn)
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        """Return E[Sym^k(H)] of the series, k = `order`: E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
         matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
@@ -127,7 +136,10 @@ class Series(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices."""
+        """Return E[Sym^order(H)] at each combination of the maps' corners: the product of their matrices.
+
+        A corner is an extreme law of those possible. Those of the first map vary slowest.
+        """
         first, *rest = (m.corner_moments(order) for m in self.maps)
         for corners in rest:
             products = corners @ first[:, None]
@@ -177,13 +189,16 @@ class Series(AbstractCombination):
         return ARROW.join(filter(None, (affine.in_words() for affine in self.maps)))
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the series without the noise of its last map where its law has outliers, and that noise."""
+        """Return the series without the noise of its last map where its law has outliers, and that noise; else None."""
         *before, last = self.maps
         plain, noise = last.detach_outliers()
         return (self, None) if noise is None else (Series([*before, plain]), noise)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit the maps in their order, each with the signal that comes through those before it."""
+        """Return the series with visit(name, hop, signal) in place of each hop, and the position behind it.
+
+        Each map is visited with the signal's second moment behind those before it, where it is known.
+        """
         visited, signal = list[AbstractRandomAffine](), position.signal
         for i, affine in enumerate(self.maps):
             changed, position = affine.visit_hops(visit, position._replace(signal=signal))
@@ -199,14 +214,17 @@ class Series(AbstractCombination):
 
 def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
-    received = known(np.diag(x.arrived.astype(float)))
+    received = known(np.diag(x.arrived.astype(float)))  # zero in place of what x lost
     power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
     uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]
     return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
-    """Return the product of two drawn maps, whose NaN rows are lost outputs: what has a gain on these is lost too."""
+    """Return the product of two drawn maps, second after first; NaN rows are lost outputs.
+
+    An output of the second that has a gain on a lost one is lost too.
+    """
     lost = jnp.isnan(first).any(axis=1)
     reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
@@ -228,7 +246,7 @@ class Stack(AbstractCombination):
         return sum(m.outputs for m in self.maps)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and stack the rows."""
+        """Draw each map; return the next state, and H: their rows [G, n] one above another, and (0, 1) below."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         rows = [h[:-1] for h in drawn]
         return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
@@ -252,7 +270,10 @@ class Stack(AbstractCombination):
         )
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return the interval of E[Sym^order(H)]: row by row the product of the maps' interval polynomials."""
+        """Return the lowest and highest value of each entry of E[Sym^order(H)] over the possible laws.
+
+        Row by row it is the product of polynomials in (y, 1), one of each independent map, by intervals.
+        """
         tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
         rows = stack_parts(multiply_moments_of_parts(self, order, tables, multiply_interval_polynomials))
         return rows[:, 0], rows[:, 1]
@@ -271,7 +292,7 @@ class Stack(AbstractCombination):
         return np.concatenate([affine.carry_known_gains(known) for affine in self.maps])
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the angles of the maps, whose outputs stand one after another."""
+        """Return the indices of outputs that are angles if the inputs `sent` are: the maps', one after another."""
         starts = np.cumsum([0, *(affine.outputs for affine in self.maps)])
         items = zip(starts, self.maps, strict=False)
         return tuple(int(start) + i for start, affine in items for i in affine.carry_angles(sent))
@@ -297,7 +318,10 @@ class Stack(AbstractCombination):
         return describe_maps_side_by_side(self.maps)
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the stack without the noises of its maps where their laws have outliers, and these noises."""
+        """Return the stack without the noises of its maps where their laws have outliers, and these noises as one.
+
+        That is zero where a map keeps its noise, and None where all do.
+        """
         parts = [affine.detach_outliers() for affine in self.maps]
         if all(noise is None for _, noise in parts):
             return self, None

@@ -68,6 +68,7 @@ class Superposed(AbstractCombination):
             tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))
             for chosen in items("places of the maps of a sum", places, "places of each map")
         )
+        # Places that are not distinct, or not below `inputs`, are fewer than the map's inputs.
         if [len({i for i in chosen if i < inputs}) for chosen in self.places] != [m.inputs for m in self.maps]:
             expected = f"distinct ones below {inputs}, as many as each map has inputs"
             raise fail("places of the maps of a sum", expected, show_value(places))
@@ -92,7 +93,10 @@ class Superposed(AbstractCombination):
 
     @property
     def as_stack(self) -> Series:
-        """The same map as the sum of the outputs of a stack, for what knows only these; its moments are larger."""
+        """The same map as a stack and the sum [I ... I] of its outputs, for what knows only stacks and hops.
+
+        Each map of the stack first selects its components of y. The moments of the stack are larger than the sum's.
+        """
         rows = np.eye(self.inputs)
         stack = Stack([Series([known(rows[list(at)]), m]) for m, at in zip(self.maps, self.places, strict=True)])
         total = np.tile(np.eye(self.outputs), (1, len(self.maps)))
@@ -118,9 +122,10 @@ class Superposed(AbstractCombination):
         return whole.transpose(*range(1, whole.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and the noise, and add up."""
+        """Draw each map and the noise; return the next state, and H of the sum: gains on all of y, and noise."""
         keys = jax.random.split(key, len(self.maps) + 1)
         state, drawn = self._draw_each(state, keys[:-1])
+        # The maps' gains side by side, then those on each component of y added up.
         gains = jnp.concatenate([h[:-1, :-1] for h in drawn], axis=1) @ self.selection
         offset = sum((h[:-1, -1] for h in drawn), self.noise.sample(keys[-1]))
         top = jnp.concatenate([gains, offset[:, None]], axis=1)
@@ -128,9 +133,9 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)], from those of the maps and the noise."""
+        """Return E[Sym^order(H)] of the sum, from those of the maps and the noise."""
         check_forgets("moments of a map", self)
-        parts = [m.moments(order).matrix[None] for m in self.maps]
+        parts = [m.moments(order).matrix[None] for m in self.maps]  # as of one corner, the nominal law
         return JointMoments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
 
     @cache_by_object
@@ -143,7 +148,7 @@ class Superposed(AbstractCombination):
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, own: AbstractRandomAffine, same_noise: SameNoise) -> bool:
-        """Return whether `own` is a sum at the same places, with such a noise, of maps that are covered one by one."""
+        """Return whether `own` is a sum at the same places, with such a noise, whose maps are possible, one by one."""
         if not isinstance(own, Superposed) or own.places != self.places or not same_noise(self.noise, own.noise):
             return False
         return self.covers_maps(own, same_noise)
@@ -170,20 +175,29 @@ class Superposed(AbstractCombination):
         return f"sum of {describe_maps_side_by_side(self.maps)}"
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
-        """Return the sum without the receiver's noise where its law has outliers, and that noise; else None for it."""
+        """Return the sum without its own noise, of which the mean stays, if its law has outliers, and that noise.
+
+        Else the sum as it is, and None.
+        """
         if not self.noise.has_outliers:
             return self, None
         mean_alone = Gaussian(np.zeros((self.outputs, self.outputs)), self.noise.mean)
         return Superposed(self.maps, mean_alone, self.places, self.inputs), self.noise
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Visit each map as one link, with the part of the signal that it takes."""
+        """Return the sum with its hops visited, each map as a link with the components of y that it takes.
+
+        The position behind it is that before it: the links side by side are not on the chain.
+        """
         parts = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
         visited = [affine.visit_hops(visit, at.select_components(taken))[0] for (affine, at), taken in parts]
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
-        """Return E[Sym^order] of the sum from those of the parts, each (corners, rows, columns)."""
+        """Return E[Sym^order(H)] of the sum from those of its maps, `parts`: each (corners, rows, columns).
+
+        A corner of the sum is a combination of corners (extreme laws) of the maps.
+        """
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
@@ -207,7 +221,7 @@ class _SumMoments(NamedTuple):
 
 
 def _expand_map_moments(matrix: Corners, outputs: int, places: Places, order: int) -> _SumMoments:
-    """Return the polynomials E[t^a | y] of one map from its E[Sym^order(H)] at each corner.
+    """Return the polynomials E[t^a | y] of one map t = H y from its E[Sym^order(H)] at each corner (extreme law).
 
     Args:
         matrix: of the map, (corners, rows, columns).
@@ -235,7 +249,10 @@ def _find_monomials_of_degree(outputs: int, degree: int, order: int) -> np.ndarr
 
 
 def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMoments:
-    """Return E[t^a | y] of a sum t of terms, from its halves: so polynomials of few variables are multiplied first."""
+    """Return the moments E[t^a | y] of a sum t of independent terms, from those of its halves.
+
+    So polynomials of few variables are multiplied first, which takes least.
+    """
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
@@ -269,7 +286,10 @@ def _add_independent_moments(a: _SumMoments, b: _SumMoments, outputs: int) -> _S
 
 @cache_arrays
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return terms of (t + r)^c with |c| = degree: places of c, b, c - b and C(c, b), for |b| = 0, 1, ..., degree."""
+    """Return terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b) with |c| = degree, for |b| = 0, 1, ..., degree.
+
+    Each: columns of the places of c, b and c - b, each among monomials of its own degree, and of C(c, b).
+    """
     names = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, rest, weight in zip(*plan_binomial_sums(outputs, degree), strict=True):
@@ -283,7 +303,7 @@ def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, .
 def _place_products(a: Places, b: Places, first: int, second: int, size: int) -> np.ndarray:
     """Return the positions of products of monomials of degree `first` in variables a and of degree `second` in b.
 
-    Among the monomials of all `size` variables: entry (i, j) is that of monomial i times monomial j.
+    Among the monomials of degree first + second of all `size` variables: entry (i, j) is that of monomial i times j.
     """
     left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
     shape = len(left), len(right)
@@ -292,13 +312,17 @@ def _place_products(a: Places, b: Places, first: int, second: int, size: int) ->
 
 
 def _assemble_moments(powers: _SumMoments, outputs: int, inputs: int, order: int) -> Corners:
-    """Return E[Sym^order(H)] at each corner from the polynomials of each degree."""
+    """Return E[Sym^order(H)] at each corner (extreme law) from the polynomials of each degree.
+
+    `powers`: of z, by degree |a| the polynomials E[z^a | y] in the components of y at their places, and 1.
+    """
     size, corners = len(powers.places) + 1, len(powers.by_degree[0])
     names = np.array([*powers.places, inputs])
     xp = library(powers.by_degree)
     matrix: Corners = xp.zeros((corners, count_monomials(outputs + 1, order), count_monomials(inputs + 1, order)))
     for degree, polynomials in enumerate(powers.by_degree):
         rows = _find_monomials_of_degree(outputs, degree, order)
+        # A row is z^a times powers of 1, a column a monomial of y times powers of 1: each of degree `order`.
         chosen = np.pad(names[factor_variables(size, degree)], ((0, 0), (0, order - degree)), constant_values=inputs)
         columns = place_monomials(chosen, inputs + 1)
         if xp is np:
@@ -313,7 +337,8 @@ def move_sensor_into_links(
 ) -> AbstractRandomAffine | None:
     """Return a sum of links of y = C x + v as a sum of links of x: C_i x + v_i through link i, in fewer numbers.
 
-    None where the parts of v that links carry are not independent, or where the channel does not begin with a sum.
+    C: `matrix`, the sensor's; i: the components of y that link i takes. None where the parts of v that links carry are
+    not independent, or where the channel does not begin with a sum.
     """
     first, *rest = channel.in_series
     if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:

@@ -25,11 +25,12 @@ T = TypeVar("T")
 def believe_untold(channel: T) -> T:
     """Return the channel as a receiver knows it before a message: each told map by the law of its numbers.
 
+    A told map is one of which a message tells numbers, as a gain.
     Where that law is not known, or `has_untold_law` says that it is not used, a map is that of typical numbers.
     """
 
     def believe(leaf: object) -> object:
-        """Return a map by the law of its numbers, anything else as it is."""
+        """Return a map by the law of its numbers, or by typical ones; anything but a told map as it is."""
         if not isinstance(leaf, AbstractToldMap):
             return leaf
         untold = _find_untold(leaf)
@@ -40,14 +41,17 @@ def believe_untold(channel: T) -> T:
 
 
 def has_untold_law(channel: AbstractRandomAffine) -> bool:
-    """Return whether `believe_untold` has the law of all that arrives: no numbers are typical, or told of two maps."""
+    """Return whether `believe_untold` gives the exact law of all that arrives, where no message has told numbers.
+
+    Not where it has to take typical numbers, nor where the same numbers are told of two maps, which then depend.
+    """
     maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
     shared = Counter(affine.memory.identity for affine in maps)
     return all(_find_untold(affine) is not None for affine in maps) and max(shared.values(), default=0) <= 1
 
 
 def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
-    """Draw what a message tells of all maps of a channel, in the order of `list_told_maps`.
+    """Draw the numbers that a message tells of all maps of a channel, in the order of `list_told_maps`.
 
     Raises:
         ValueError: numbers whose law nobody knows.
@@ -59,7 +63,10 @@ def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
 
 
 def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:
-    """Return a map by the law of the numbers that are told; None where there is none, or more than finitely many."""
+    """Return a map by the law of the numbers that a message would tell; None where that gives no map known here.
+
+    A gain may have any law; of other numbers there must be finitely many values, each with its map.
+    """
     if isinstance(affine, PilotedHop):  # known before its reading by the law of its gain
         return GainAndNoise(affine.memory.law, affine.matrix, affine.noise)
     if not isinstance(affine, ToldMap) or not isinstance(affine.memory, FreshNumbers):

@@ -64,7 +64,10 @@ class _DenseInverseHessian:
         self.is_first_update = True
 
     def times(self, vector: np.ndarray) -> np.ndarray:
-        """Return H v; steepest descent where -H v is no direction of descent."""
+        """Return H v, with the inverse Hessian H = `self.matrix` and the gradient v.
+
+        Where v'H v is not positive -H v does not descend: H begins anew, so that -H v is of length FIRST along -v.
+        """
         if (self.matrix @ vector) @ vector <= 0:
             self.matrix = np.eye(len(vector)) * FIRST / np.linalg.norm(vector)
         return np.asarray(self.matrix @ vector)
@@ -72,7 +75,7 @@ class _DenseInverseHessian:
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
         """Update H after a step s that changed the gradient by y, unless the curvature s'y is not positive.
 
-        H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
+        H: the inverse Hessian, `self.matrix`. H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
         """
         curvature, is_first = float(s @ y), self.is_first_update
         self.is_first_update = False
@@ -93,6 +96,7 @@ class _LimitedInverseHessian:
     def times(self, vector: np.ndarray) -> np.ndarray:
         """Return H v by two loops over the updates, newest first and then oldest first.
 
+        `self.updates`: pairs (s, y) of a step and of the change of the gradient over it, the newest last.
         H = V'H_before V + s s'/s'y with V = I - y s'/s'y, and H = I s'y/y'y (of the newest) before the oldest.
         """
         v, weights = vector, []
@@ -117,7 +121,8 @@ def _backtrack(
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
     """Shorten the step until the value is finite and falls enough (Armijo); None where no step does.
 
-    Returns the step, and value and gradient at its end; `slope`: direction' gradient at x.
+    Returns the step, and value and gradient at its end; `slope`: direction' gradient at x. Armijo: a step must give at
+    least the share DECREASE of what the slope promises; else its length is multiplied by SHORTEN, down to SHORTEST.
     """
     length = 1.0
     while length >= SHORTEST:

@@ -63,7 +63,7 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
 
     Args:
         network: relays that filter.
-        gains: K by filter, (steps, n, received).
+        gains: K by filter, (steps, n, received): by n states and the numbers that the filter receives.
 
     Raises:
         ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
@@ -84,7 +84,10 @@ def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
 
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the gains by filter as one block matrix for each step."""
+    """Return the gains by filter as one block matrix for each step: rows by filter and state, columns all R numbers.
+
+    The R numbers received are in the order of the filters; each filter's gain stands in the columns of its own ones.
+    """
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, first = len(network.states), network.filters[0]
@@ -100,7 +103,7 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
 def split_gains(
     network: RelayNetwork, joined: Float[np.ndarray, "steps Fn R"]
 ) -> dict[str, Float[np.ndarray, "steps n _"]]:
-    """Return the gains by filter from block matrices."""
+    """Return the gains by filter from block matrices for each step: the inverse of `join_gains`."""
     n, ends = len(network.states), np.cumsum(network.received)
     return {
         name: np.asarray(joined)[:, f * n : (f + 1) * n, end - size : end]
@@ -114,6 +117,7 @@ def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDe
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
         raise fail("design", "finite second moments", f"some that are not after step {step} (is a link noiseless?)")
+    # The moments are of (x, e_1 .. e_F), e_f the error of filter f. The power is by sender, of which the first is y's.
     blocks = {name: slice((1 + f) * n, (2 + f) * n) for f, name in enumerate(network.filters)}
     return RelayDesign(
         gains=split_gains(network, np.asarray(propagated.gains)),
@@ -203,8 +207,11 @@ def _make_gains(
 
 
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
-    """Raise ValueError for a design with other moments at k = 0 than the network's, as a periodic one has."""
-    # Equal to the rounding of both; of a periodic design first and last to what its iteration ends at.
+    """Raise ValueError for a design whose moments at k = 0 are not the network's own, as those of a periodic one.
+
+    A periodic design has one step for each slot, and ends with the moments with which it begins.
+    """
+    # Equal to the rounding of both; of a periodic design, first and last are equal as far as its iteration went.
     expected, start = initial_error_covariance(network), design.moments[0]
     if start.shape != expected.shape or not np.allclose(start, expected, rtol=1e-9, atol=0.0):
         periodic = len(design.moments) == len(network.slots) + 1 and np.allclose(start, design.moments[-1], rtol=1e-6)
@@ -219,7 +226,10 @@ def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -
 
 
 def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
-    """Return the matrices C_k of the cost, <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance."""
+    """Return the matrices C_k of the cost, <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance.
+
+    <A, B> is the sum of A_ij B_ij. The moments are of (x, e_1 .. e_F), each of n entries; the receiver's error is last.
+    """
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))
     matrices[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
@@ -229,8 +239,8 @@ def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int
 def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
     """Design gains with which each filter minimises the trace of its own next error covariance, in one forward pass.
 
-    K_f = E[e_f i_f'] E[i_f i_f']^-1, i_f the innovation. Optimal for one step only: a relay's gain also decides
-    what the receiver can know later (see `receiver_error_design`).
+    K_f = E[e_f i_f'] E[i_f i_f']^-1, e_f the error of filter f, i_f its innovation. Optimal for one step only: a
+    relay's gain also decides what the receiver can know later (see `receiver_error_design`).
 
     Args:
         network: relays that filter.
@@ -313,7 +323,7 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the block matrices of the relays' gains, zero for the receiver."""
+    """Return the block matrices (`join_gains`) of the relays' gains, zero for the receiver, which comes last."""
     gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:
@@ -372,11 +382,15 @@ def make_receiver_view(
 def _list_receiver_views(
     steps: RelaySteps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return the system of (x, e_relays) that `make_receiver_view` describes, at each step."""
+    """Return at each step the system that the receiver sees: of x and the relays' errors (`make_receiver_view`).
+
+    `start`: the covariance of x and all filters' errors before the first step; `gains`: of all filters (`join_gains`).
+    """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
-        """Return the moments after a step, and the system at it."""
+        """Return the moments of x and all filters' errors after a step, and the system that the receiver sees at it."""
         step, gain = row
+        # Predicted, then corrected by the gains, without those on numbers that no link brings in this slot.
         after = correct_moments(step_moments(step, moments)[0], gain * step.receives_in_slot)
         return after, make_receiver_view(step, moments, gain)
 

@@ -90,7 +90,7 @@ def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d
     """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
-    for r in range(len(steps.received) - 1):
+    for r in range(len(steps.received) - 1):  # the last filter is the receiver, which sends nothing
         s = np.zeros((n, d))
         s[:, :n], s[:, (1 + r) * n : (2 + r) * n] = np.eye(n), -np.eye(n)  # s_r = x - e_r
         sent = steps.sensing @ s
@@ -165,7 +165,10 @@ def _scale_into_limit(
 def _compute_cost_and_slack(
     problem: PowerLimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
-    """Return the cost of given gains, and the share of each limit that they leave free."""
+    """Return the cost of given gains, and the share of each step's power limit that they leave free.
+
+    With <A, B> = sum of A_ij B_ij: the cost is sum_k <cost_k, moments after step k>, and the power <form_k, the same>.
+    """
     moments = propagate_error_moments(problem.steps, problem.start, gains).moments[1:]
     form, limit = problem.power
     return jnp.sum(problem.cost * moments), 1 - jnp.sum(form * moments, axis=(1, 2)) / limit
@@ -175,7 +178,10 @@ def _compute_cost_and_slack(
 def _change_gains(
     gains: Float[Array, "time Fn R"], units: Float[Array, "time r r"], x: Float[Array, "time r"], steps: RelaySteps
 ) -> Float[Array, "time Fn R"]:
-    """Return the gains with their free entries changed by x, in the units (columns) of each step."""
+    """Return the gains with their free entries changed by units_k x_k at each step k; x (time, r), r free entries.
+
+    Free are the entries that multiply what the filter itself receives (`gain_mask`); the others are always zero.
+    """
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
 
@@ -191,9 +197,12 @@ def _compute_cost_with_barrier(
     """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
 
     def value(x: jax.Array) -> jax.Array:
-        """Return the cost and barrier at gains moved by x."""
+        """Return cost - barrier sum log(slack) at gains moved by x, `slack` the free share of each power limit.
+
+        `gains`, `units` (of x), `barrier` (a weight) and `problem` stay. Infinite where a limit is passed.
+        """
         cost, slack = _compute_cost_and_slack(problem, _change_gains(gains, units, x, problem.steps))
-        inside = jnp.all(slack > 0)
+        inside = jnp.all(slack > 0)  # outside, the logarithm is of 1, so that no gradient becomes NaN
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
 
@@ -208,7 +217,10 @@ def _evaluate_barrier(
     barrier: float,
     x: Float[np.ndarray, "variables"],
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
-    """Return `_compute_cost_with_barrier` of all variables in one vector."""
+    """Return value and gradient of `_compute_cost_with_barrier`, with the changes of all gains in one vector x.
+
+    So a search for the minimum takes it. `units` (steps, r, r): in columns, what the r variables of a step change.
+    """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
 
@@ -232,14 +244,16 @@ def _choose_step_units(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the gradient by the moments before a step, from that of later steps, and the units of its gains."""
+        """Return the cost's gradient by the moments before a step, from that of `later` steps, and the gains' units."""
         step, gain, moments_before, own = row
-        lam = later + own
+        lam = later + own  # by the moments after the step; own: of the step's own cost
         uncorrected, _ = step_moments(step, moments_before)
         hessian, _ = gain_hessian(uncorrected, lam, step, DAMPING)
         # 1 for a gain on what is transmitted, else 0: such a gain stays.
         _gain_rows, received = np.nonzero(gain_mask(step))
         is_free = jnp.asarray(step.receives_in_slot)[received]
+        # With the Hessian L L' the columns of L'^-1 are changes of the gains that all curve the cost alike.
+        # Units are the columns of L'^-1, with L L' the Hessian: along each the cost curves alike.
         unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, jnp.diag(is_free))
         return moment_adjoint(step, gain, lam), is_free[:, None] * unit
 
@@ -323,9 +337,9 @@ def _sweep_backward(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the gradient by the moments before a step, from that of later steps, and Lam."""
+        """Return the cost's gradient by the moments before a step, and Lam, that by the moments after it."""
         step, gain, uncorrected, own_cost = row
-        lam = later + own_cost
+        lam = later + own_cost  # of later steps' cost, and of the step's own
         best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
         return moment_adjoint(step, best_gain, lam), lam
 
@@ -336,14 +350,17 @@ def _sweep_backward(
 
 
 def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step."""
+    """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step.
+
+    `ahead`: the gradient of the cost by the moments after each step; `gains`: those before, which damp the change.
+    """
 
     def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         """Return the moments after a step with its best gain; and this gain and these moments."""
-        step, gain, ahead_k = row
-        z, _ = step_moments(step, moments)
+        step, gain, ahead_k = row  # ahead_k: gradient of the cost by the moments after the step
+        z, _ = step_moments(step, moments)  # those before its correction
         gain = minimise_cost_ahead(z, ahead_k, gain, step)
         after = correct_moments(z, gain)
         return after, (gain, after)
@@ -370,7 +387,7 @@ def _alternate_sweeps(
     """Alternate backward and forward sweeps from the local gains, `count` of them, and return the best gains."""
 
     def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
-        """Sweep backward and forward once; keep the best gains so far with their cost."""
+        """Sweep backward and forward once; keep the best gains so far with their cost, sum_k <cost_k, moments_k>."""
         gains, moments = _sweep_forward(steps, start, search.gains, _sweep_backward(steps, start, cost, search.gains))
         value = jnp.sum(cost * moments)
         better = value < search.cost

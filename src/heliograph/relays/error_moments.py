@@ -63,7 +63,11 @@ def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
 
 
 def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
-    """Return E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
+    """Return the mean of (y, C s_1, ..., C s_relays, 1): what the sensor and the relays send, and the constant 1.
+
+    y = C x+ + v is measured after the step, s_r are the relays' estimates before it. Each is unbiased, so the mean is
+    that of C x whatever the gains are.
+    """
     y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
     relayed = step.sensing @ step.state_mean
     return jnp.concatenate([y, *[relayed] * (len(step.received) - 1), jnp.ones(1)])
@@ -72,7 +76,8 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
 def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], SentMoments]:
     """Return Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
-    d = (1 + F) n, z = d + R.
+    eta = (x, e_1 .. e_F): the state and the errors of F filters, which receive R numbers; eta+ is that after the step.
+    Sizes: d = (1 + F) n, z = d + R.
     """
     maps, mean = make_error_step_maps(step), sent_mean(step)
     # Second moments of what is sent, from the covariance of (x, e_1 .. e_F, w, v).
@@ -88,7 +93,11 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
 
 
 def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
-    """Return the covariance of eta+ = eta+ before corrections - (0; K) innovations."""
+    """Return the covariance of eta+ = eta+ before corrections - (0; K) innovations, with K the `gain`.
+
+    eta = (x, e_1 .. e_F), the state and the filters' errors: only these are corrected. `z`: the covariance of (eta+
+    before corrections, innovations).
+    """
     rows, received = gain.shape
     d = z.shape[0] - received
     full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
@@ -108,6 +117,7 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     """Return 1 for each innovation whose variance is above the rounding of what is sent, 0 for the others.
 
     Of a relay that receives nothing but itself through a known gain the innovation is zero, computed from large ones.
+    `predicted`: the covariance of (x, e_1 .. e_F, innovations); ROUNDING: a few units in the last place.
     """
     n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
     # Sizes of what is sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
@@ -167,7 +177,10 @@ def propagate_error_moments(
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Return the moments after a step; and its gains, these moments and the powers."""
+        """Return the moments after a step, to go on with; and its gains, these moments and the senders' powers.
+
+        Without a given `gain` each filter has the one that is best for itself at this step.
+        """
         step, gain = row
         uncorrected, sent = step_moments(step, moments)
         used = local_gain(uncorrected, step) if gain is None else gain * step.receives_in_slot
@@ -190,7 +203,7 @@ def gain_hessian(
 
     Z: `predicted` moments (eta+ before corrections, innovations). Lam: `ahead`, the gradient of the cost of later steps
     by the moments after this one. The entry for the gains ab and cd is Lam_ac Z_bd; 1 on the diagonal of a gain that
-    receives nothing. `damping` is relative to the mean of the diagonal.
+    receives nothing. `damping` is relative to the mean of the diagonal. Free are the gains on what a filter receives.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]
@@ -208,7 +221,8 @@ def minimise_cost_ahead(
     """Return the gains K of all filters that minimise the cost of later steps, tr Lam [I -(0; K)] Z [I -(0; K)]'.
 
     Z and Lam as for `gain_hessian`; a little damped towards the gains `old`, which decides what the cost does not.
-    (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains.
+    (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains. Indices e
+    stand for the errors, i for the innovations.
     """
     rows, columns = np.nonzero(gain_mask(step))
     n, d = step.transition.shape[-1], ahead.shape[0]

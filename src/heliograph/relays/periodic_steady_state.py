@@ -37,7 +37,7 @@ RepeatedPeriods = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last re
 
 
 def periodic_steps(network: RelayNetwork) -> RelaySteps:
-    """Return the steps of one period, at the stationary mean of the state.
+    """Return the steps of one period, one for each slot of the schedule, at the stationary mean of the state.
 
     Slots change links only, so the plant's step is that of the first slot, and the mean solves m = A m + b.
 
@@ -57,7 +57,9 @@ def periodic_steps(network: RelayNetwork) -> RelaySteps:
 
 
 def periodic_local_error_design(network: RelayNetwork) -> RelayDesign:
-    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period.
+    """Return the steady state of `local_error_design` of a `network`: gains and moments over one period of its slots.
+
+    Each filter then minimises its own next error, in each slot. Found by repeating the period, PERIODS times at most.
 
     Args:
         network: relays that filter, in slots that repeat.
@@ -100,11 +102,15 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     joined, n = relay_gains(network, gains), len(network.states)
+    # Of (x, errors of the relays), which the receiver estimates, x comes first.
     return np.asarray(_steady_behind(_make_converging_steps(network, joined), joined))[:, :n, :n]
 
 
 def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
-    """Return the steps of one period, checked for gains under which the second moments converge."""
+    """Return the steps of one period, one for each slot; raise ValueError where moments do not converge by the gains.
+
+    They do where their linear map over a period has a spectral radius below 1.
+    """
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
     radius = spectral_radius(np.asarray(_period_operator(steps, gains)))
@@ -126,15 +132,22 @@ def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[
 
 
 def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> PropagatedMoments:
-    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`."""
+    """Return moments over a period that ends as it begins; differentiable in the gains, valid where `is_covariance`.
+
+    Over a period the moments, of size d (x and all filters' errors), are an affine map of those before it: the start is
+    its fixed point. Where the moments diverge there is one too, which is no covariance.
+    """
     d = gains.shape[1] + steps.transition.shape[-1]
     start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
     return propagate_error_moments(steps, start, gains)
 
 
 def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
-    """Decide whether all moments are positive semidefinite to rounding: the fixed point is then the limit."""
-    fixed = jax.lax.stop_gradient(moments)
+    """Decide whether all moments, at a fixed point over a period, are positive semidefinite to rounding (INDEFINITE).
+
+    The moments then converge to this fixed point; else they diverge.
+    """
+    fixed = jax.lax.stop_gradient(moments)  # only decided: nothing is differentiated
     smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
     return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
 
@@ -159,14 +172,14 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
         return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
 
     def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take one Riccati step: return the covariance after a slot, and the best gain."""
-        joint = predict(covariance, side)
+        """Take a Riccati step by a slot's system `side`: return the covariance of (x, e_relays), and best gain."""
+        joint = predict(covariance, side)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Take one step with a given gain: return the covariance after a slot, to go on with and to collect."""
-        side, gain = row
+        side, gain = row  # `side`: the system of (x, e_relays) that the receiver sees in the slot
         corrected = correct_moments(predict(covariance, side), gain)
         return corrected, corrected
 
@@ -196,7 +209,10 @@ _steady_behind = compile_in_float64(steady_receiver_covariance)
 
 @compile_in_float64
 def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
-    """Return the linear part of the map of second moments over one period, a matrix on their entries."""
+    """Return the linear part of the map of second moments over one period, a matrix on the entries of a triangle.
+
+    The map is affine, so it may be linearised anywhere, here at 0. Its spectral radius says whether moments converge.
+    """
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate_error_moments(steps, m, gains).moments[-1], jnp.zeros((d, d)))
     return jnp.asarray(make_matrix_on_triangle_entries(jax.vmap(linear), (d, d)))
@@ -206,8 +222,9 @@ def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Fl
 def _iterate_local_design(
     steps: RelaySteps, start: Float[Array, "d d"]
 ) -> tuple[PropagatedMoments, Float[jax.Array, ""]]:
-    """Repeat the period of the local design until its moments change by less than CONVERGED.
+    """Repeat the period of the local design (gains best for each filter's next error) until its moments are steady.
 
+    They are where they change by less than CONVERGED, relative to the largest.
     Returns gains, moments and power over the last period, and the last relative change of the moments.
     """
     moments, change = _repeat_until_steady(
@@ -222,7 +239,7 @@ def _repeat_until_steady(
     """Repeat a period until its relative change is below `tolerance`; return the last value and its change."""
 
     def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
-        """Return the value after one more period, its relative change, and the count of periods."""
+        """Return the value after one more `period`, its change (relative to its largest entry), and their count."""
         value, _, count = carry
         after = period(value)
         size = jnp.maximum(jnp.max(jnp.abs(after)), np.finfo(float).tiny)
@@ -242,6 +259,7 @@ def periodic_receiver_error_design(
 ) -> RelayDesign:
     """Design gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
+    P: the receiver's error covariance; slots: turns of the senders, which repeat.
     Descent through the fixed point of the second moments; the result is a local minimum.
 
     Args:
@@ -265,6 +283,8 @@ def periodic_relays_for_best_receiver(
     network: RelayNetwork, start: GainsByFilter | None = None, power_limit: "Float[ArrayLike, '*slots'] | None" = None
 ) -> dict[str, Float[np.ndarray, "slots n _"]]:
     """Design relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
+
+    P: that receiver's error covariance.
 
     Args:
         network: the network, which varies with its slots only.
@@ -293,14 +313,20 @@ def _tune_gains(
     cost: Cost,
     power_limit: ArrayLike | None,
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the gains of least cost near `start`, checked to be one for each slot."""
+    """Return the gains of least cost near `start`, which are checked to be one block matrix for each slot.
+
+    `free`: which of the R received numbers have gains that may change; `cost`: of gains, with the penalty of power.
+    """
     steps = periodic_steps(network)
     check_gains_of_slots(network, start)
     return minimise_over_gains(network, steps, start, free, cost, power_limit)
 
 
 def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers."""
+    """Return by slot tr P with these gains of the receiver, whether all moments are sound, and the relays' powers.
+
+    P: the receiver's steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     # The moments begin with those before the first slot. The receiver's error is the last part of what they are of.
     receiver = steady.moments[1:, -n:, -n:]
@@ -309,7 +335,10 @@ def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Arr
 
 
 def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers."""
+    """Return by slot tr P of the best receiver, whether all moments are sound, and the relays' powers.
+
+    P: the steady error covariance. Sound: positive semidefinite, as moments are that do not diverge.
+    """
     steady, n = steady_moments(steps, gains), steps.transition.shape[-1]
     covariance = steady_receiver_covariance(steps, gains)
     # The receiver's own part of the moments is left out: its gains among `gains` are not used.

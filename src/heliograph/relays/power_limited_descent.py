@@ -78,7 +78,10 @@ def minimise_over_gains(
 
 
 def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
-    """Return the x of least cost, found by descent from x; `arguments` are those of the cost behind x."""
+    """Return the x of least cost, found by descent from x; `arguments` are those that the cost takes after x.
+
+    The cost gives its value, its gradient by x and the power, which only the multipliers of the limit need.
+    """
 
     def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the cost of x, and its gradient."""
@@ -96,7 +99,7 @@ def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np
 def _find_largest_entries(
     network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the largest entry of each filter's gain in each slot, at every entry of that gain."""
+    """Return the largest magnitude in each filter's gain in each slot, at every entry of it: units of changes."""
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     # Of a filter whose gains are small or zero in a slot, a thousandth of the largest of all.
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
@@ -118,7 +121,8 @@ def _penalise_power(
 ) -> Float[jax.Array, ""]:
     """Return log sum_s trace_s + sum_s max(0, lambda_s + c g_s)^2 / 2c, g = power / limit - 1, c the STIFFNESS.
 
-    Infinite where the moments are not `sound`, so that a search turns back.
+    By slot s: trace, of the receiver's error covariance; g, the relative excess over the limit of power; lambda, its
+    multiplier in an augmented Lagrangian. Infinite where the moments are not `sound`, so that a search turns back.
     """
     total = jnp.sum(traces)
     sound = sound & (total > 0)

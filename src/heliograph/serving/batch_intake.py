@@ -109,7 +109,11 @@ class BatchIntake:
         return outcomes
 
     def _refuse_implausible(self) -> set[str]:
-        """Step what was taken, note what is implausible in `_refused`, and restore its plants; return their names."""
+        """Step the plants that took events, and undo what was implausible; return the names of these plants.
+
+        Each implausible event is noted in `_refused` with its reason, and its plant is as before the batch again: the
+        other events of the plant are to be taken anew.
+        """
         self.fleet.step({taken.plant.name: taken.plant for taken in self._taken}.values())
         restored = set[str]()
         for i, why in self._judges.find_implausible(self._taken).items():
@@ -121,8 +125,11 @@ class BatchIntake:
         return restored
 
     def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
-        """Give a message to its plant, as far as it was read; return its outcome."""
-        if isinstance(message, str):
+        """Give a message to its plant, as far as it was read; return its outcome.
+
+        `number`: that of the message in the batch; `wall`: the time by this machine's clock.
+        """
+        if isinstance(message, str):  # why it could not be read at all
             return MessageOutcome(why=message)
         if isinstance(message, UnreadMessage):
             return MessageOutcome(self._count_unread(message), why=message.why)
@@ -134,7 +141,8 @@ class BatchIntake:
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return {(number of a message, True): why its inputs lead to no valid prediction}, as `_refused` has it.
 
-        They are predicted with from the state before the batch.
+        They are predicted with from the state before the batch. A message has inputs beside its values, or is of
+        inputs alone.
         """
         numbers, plants, inputs = list[int](), list[PlantState | None](), []
         for i, message in enumerate(messages):
@@ -187,7 +195,10 @@ class BatchIntake:
     def _use_inputs(
         self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
     ) -> list[str]:
-        """Give a measurement's inputs to its plant, if it has any; return a note if they are refused, for a reason."""
+        """Give the inputs beside a measurement to its plant, if there are any; return a note if they are refused.
+
+        `why_refused`: the reason, if they are implausible; None else. `timed`: the message's events with their times.
+        """
         if timed.inputs is None:
             return []
         if why_refused is None:
@@ -307,18 +318,18 @@ class BatchIntake:
             number: number of its message in the batch.
             plant: the plant.
             message: its message, by whose node's clock it is dated.
-            event: the event.
+            event: the event, a measurement or inputs.
             wall: time by the clock on the wall, None if it is not known.
         """
         is_dated = message.arrival is not None
         verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
         if verdict == "used":
-            row, _ = plant.changes[-1]  # that which holds it now
+            row, _ = plant.changes[-1]  # the row of the plant's history that holds it now
             self._taken.append(CandidateEvent(number, plant, event, row))
         return verdict
 
     def _restore_plant(self, name: str) -> None:
-        """Restore a plant to its state before the batch."""
+        """Restore a plant to its state before the batch; one that began in the batch is removed."""
         plant, before = self.plants[name], self._before[name]
         if before.known:
             self.fleet.undo_events(plant, before.clock)
@@ -327,7 +338,11 @@ class BatchIntake:
             self.fleet.end_plant(self.plants.pop(name))
 
     def _choose_origin(self, message: AnyMessage) -> datetime | None:
-        """Return midnight, UTC, before a plant's first message, or the date of step 0; None where times are numbers."""
+        """Return the date from which a plant's times are counted, by its first message; None where they are numbers.
+
+        In continuous time it is midnight, UTC, before; else the message's own time, as the date of step 0, where a step
+        has a length.
+        """
         if not isinstance(message.time, datetime):
             return None
         if self.fleet.program.dt is None:
@@ -337,6 +352,6 @@ class BatchIntake:
 
 def find_plant_name(message: Read) -> str | None:
     """Return the name of the plant of a message; None of one that names none."""
-    if isinstance(message, str):
+    if isinstance(message, str):  # why it could not be read at all
         return None
     return message.read.plant if isinstance(message, UnreadMessage) else message.plant

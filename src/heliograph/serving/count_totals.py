@@ -59,7 +59,7 @@ class CountTotals:
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
     def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
-        """Add what has changed in a plant's counts since they were added last."""
+        """Add what has changed in a plant's counts (`links`, by node) since they were added last, to `by_node`."""
         for node, link in links.items():
             now = tuple(list_counts_of_link(link).values())
             before = self._seen.get((plant, node), (0,) * len(FIELDS))

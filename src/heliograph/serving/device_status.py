@@ -20,7 +20,7 @@ class DeviceStatusService:
 
     def __init__(self, service: BatchService, words: DeviceStatuses, store: StoreProtocol):
         self._service, self._words, self._store = service, words, store
-        self._unkept = dict[str, int]()
+        self._unkept = dict[str, int]()  # words that the store does not have yet, as numbers by topic
         words.restore(store.words())
 
     def unpublished(self) -> list[Output]:
@@ -42,7 +42,7 @@ class DeviceStatusService:
         return self._service.finish(ended)
 
     def _keep_words(self) -> None:
-        """Store the words that came since the last call."""
+        """Store the words of devices (last messages on whether they are online) that came since the last call."""
         # Words stay unkept until the store has them: it may be away, and raise.
         self._unkept |= self._words.pop_changed_words()
         if self._unkept:

@@ -53,7 +53,8 @@ class EstimateWriter:
         """Return a line of a row with `size` outputs, with %b or %d for each number, and what fills it.
 
         That is the outputs' columns in the order in which the line has them, and which of its places take whole
-        numbers. The line is written from a row that has FIRST + its column number in each column.
+        numbers. The line is written from a row that has FIRST + its column number in each column: so the number that
+        stands at a place (found by COLUMN) tells its column, and without a point that it is written as a whole one.
         """
         numbered = FIRST + np.arange(float(size))
         numbered[self._reasons] = 0.0  # nothing is refused
@@ -96,7 +97,10 @@ class EstimateWriter:
         return lines
 
     def _write_estimates(self, outputs: list[float]) -> dict[str, dict[str, object]]:
-        """Return all filters' estimates after a row, by node and filter."""
+        """Return all filters' estimates after a row, by node and filter, from the row's numbers `outputs`.
+
+        `_nodes`: by node, where each of its filters has its numbers among these.
+        """
         return {
             node: {columns.filter: self._tabulate_estimate(columns, outputs) for columns in places}
             for node, places in self._nodes.items()
@@ -105,7 +109,8 @@ class EstimateWriter:
     def _tabulate_estimate(self, columns: FilterColumns, outputs: list[float]) -> dict[str, object]:
         """Return one filter's estimate, its claim, and what it made of what arrived, as a table for JSON.
 
-        `columns` are the filter's among `outputs`, the numbers of a row.
+        `columns` are the filter's among `outputs`, the numbers of a row. The claim says what the covariance is worth:
+        "exact", "upper" (a bound), "none" and so on.
         """
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row

@@ -126,7 +126,10 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
 
 
 def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
-    """Return a message; or why it cannot be read, with what names it (plant, node, count, time) if it has these."""
+    """Return a message; or why it cannot be read, with what names it (NAMED: plant, node, count, time) if it has these.
+
+    Of a payload too long only the first LONGEST bytes are looked at.
+    """
     try:
         return read_message(payload)
     except InputError as error:
@@ -172,6 +175,7 @@ def _refuse_doubled_fields(payload: bytes, read: AnyMessage) -> None:
     """Raise ValueError where a line has a field twice, of which decoders use the last.
 
     Each field's name and each text has two quotes: a line that has just the quotes of what was read has no field twice.
+    Only others are decoded again, which takes longer.
     """
     # Fields that are always there: node, sequence, time; texts: node, and what else is one.
     fields = 3 + (read.plant != "") + (read.values != []) + (read.inputs is not None) + (read.arrival is not None)
@@ -192,13 +196,17 @@ def _describe_payload(payload: bytes) -> str:
         return "brackets nested too deeply"
     except ValueError as error:
         where = f" from byte {error.pos + 1} on" if isinstance(error, json.JSONDecodeError) else ""
+        # What looks like a row of a table gets a hint.
         row = b"," in payload and b"{" not in payload
         table = "; `heliograph replay` sends the rows of a table as messages" if row else ""
         return f"{show_value(payload)}, which is no JSON{where}{table}"
 
 
 def convert_time_to_seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
-    """Return a time as a number: of a date the seconds since `origin`, exact to the microsecond before rounding."""
+    """Return a time as a number: of a date the seconds since `origin`, exact to the microsecond before rounding.
+
+    A plant's times are all dates, if it has an origin, or all numbers: ValueError at the other kind.
+    """
     mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):
         if origin is None:

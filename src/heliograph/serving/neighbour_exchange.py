@@ -28,6 +28,7 @@ class NeighbourMessenger:
     def __init__(self, fleet: Fleet, moment: Moment):
         self.fleet, self._moment = fleet, moment
         nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
+        # The filter of the node that this network is; "" and None where it is no single node, which sends nothing.
         self._name = next(iter(nodes), "")
         self._node = nodes.get(self._name)
 
@@ -37,7 +38,10 @@ class NeighbourMessenger:
         return self._node is not None
 
     def make_messages(self, plants: Iterable[PlantState]) -> list[Output]:
-        """Return the messages that the events taken since the last finalisation make due, after their steps."""
+        """Return the messages to neighbours that are due by the events taken since rows last became final.
+
+        None of a network that is no single node.
+        """
         if self._node is None:
             return []
         return [
@@ -69,15 +73,16 @@ class NeighbourMessenger:
         return due
 
     def _has_measurement(self, events: Iterable[tuple[int, int, float]]) -> bool:
-        """Return whether events, by their keys, include the node's measurement, or any where it has no sensor.
+        """Return whether events include the node's measurement, or any message where the node has no sensor.
 
+        An event's key is (number of the node, count, time).
         The node itself is number 0 of its network; its neighbours, whose messages come to it, follow.
         """
         assert self._node is not None
         return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
 
     def _make_row_messages(self, plant: PlantState, row: HeldRow) -> list[Output]:
-        """Return a row's message to each receiver: estimate and covariance before the step, and the measurement."""
+        """Return a row's message to each neighbour: the node's estimate and covariance before it, its measurement."""
         assert self._node is not None
         pool, network = self.fleet.pool, self.fleet.network
         _, central, *_ = pool.step_rows.state.tree(pool.table[row.slot, pool.state])

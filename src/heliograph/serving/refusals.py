@@ -17,8 +17,11 @@ WHY: dict[Verdict, str] = {
 
 
 def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
-    """Return the refusal of a message, with what names it as far as it was read."""
-    if isinstance(message, str):
+    """Return the refusal of a message, to be published, with what names it as far as it was read.
+
+    `why`: the kind of reason; `detail`: it in words.
+    """
+    if isinstance(message, str):  # nothing was read
         return make_refusal_entry(None, {}, why, detail)
     read = message.read if isinstance(message, UnreadMessage) else message
     moment = read.time.isoformat() if isinstance(read.time, datetime) else read.time

@@ -115,7 +115,7 @@ class Service:
         return outputs
 
     def resume(self) -> None:
-        """Load the stored plants of a network in which silence says something, which goes on."""
+        """Load the stored plants, up to ROWS rows, where a silent sender says something: its silence goes on."""
         if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
@@ -124,7 +124,7 @@ class Service:
             self._silence.resume(self.plants)
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
-        """Tell the estimates by now of plants of which a sender has timed out; nothing is committed."""
+        """Return provisional estimates by now of plants of which a sender has timed out; nothing is committed."""
         late = self._silence.find_plants_overdue(self.plants.values(), now)
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
@@ -157,7 +157,7 @@ class Service:
             return []
 
     def _make_step_messages(self, now: datetime) -> list[Message]:
-        """Return a message for each plant of which another step has begun: inputs that all stay as they were."""
+        """Return a message for each plant of which another step has begun: null inputs, which stay as they were."""
         unchanged: list[float | None] = [None] * self.fleet.program.given
         return [
             Message.model_construct(
@@ -215,14 +215,14 @@ class Service:
         return [output for output in self.store.unpublished() if (output.number or 0) > known]
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """Note that these outputs were published; the next commit records it."""
+        """Note the largest number of these outputs, which were published; the next commit records it."""
         self._published = max(
             (output.number for output in outputs if output.number is not None), default=self._published
         )
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit everything. Without a store, and if there will be no more messages, all rows become final."""
-        last = list(self.plants.values()) if ended and not self.store.keeps else []
+        last = list(self.plants.values()) if ended and not self.store.keeps else []  # plants that end here
         finalised = self.fleet.finalise_plants(last, all_=True)
         entries = self._write_finals(finalised)
         self.fleet.free_slots(finalised)
@@ -256,7 +256,7 @@ class Service:
         return outputs + sent + provisional, committed
 
     def _warn_of_doubts(self, plants: Sequence[PlantState]) -> None:
-        """Say what is new of these plants: angles known too little, readings that repeat, remarks of filters."""
+        """Warn, by `_doubt`, of what is new: angles known too little, readings that repeat, remarks of filters."""
         if self._doubt is not None:
             for name, line in (*self._angles.find_new(plants), *self._held.find_new(plants)):
                 self._doubt(f"warning: plant {name!r}, {line}; not said again, nor of other plants")
@@ -295,7 +295,7 @@ class Service:
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return an entry on a message that was refused, and on each part of one that was left out; warn of the first.
 
-        `outcome` has a verdict other than "used", or notes on parts of the message.
+        `outcome` has a verdict other than "used" (None: unread), or notes on parts of the message.
         """
         entries = [make_refusal_of_message(message, "implausible", note) for note in outcome.notes]
         if outcome.verdict is not None and outcome.verdict != "used":
@@ -305,12 +305,12 @@ class Service:
         return entries
 
     def _warn_of_implausible(self, message: AnyMessage, why: str) -> None:
-        """Report the first implausible message, once."""
+        """Report the first implausible message by `_say`, once."""
         if self._say is not None:
             plant = f"of plant {message.plant!r} " if message.plant else ""
             what = f"message {message.sequence} of {message.node!r} {plant}is implausible"
             self._say(f"warning: {what}: {why}; such messages are reported as refused and counted, and not said again")
-            self._say = None
+            self._say = None  # once
 
     def _commit(self, touched: dict[str, PlantState], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Commit the changed plants and entries; return the outputs to publish.
@@ -346,7 +346,7 @@ class Service:
         self._silence.forget_plant(name)
 
     def _load_plants(self, names: Iterable[str]) -> None:
-        """Load the plants of these names that are not in memory from the store; note which of them are damaged."""
+        """Load the plants of these names that are not in memory from the store; note in `_damage` the damaged ones."""
         self._damage = {}
         for name, stored in self.store.load([name for name in names if name not in self.plants]).items():
             if stored.damage:
@@ -354,16 +354,16 @@ class Service:
                 continue
             plant = self.plants[name] = unpack_plant(name, stored.body, self.fleet)
             plant.version = stored.version
-            self._remarks.note_said(plant)
+            self._remarks.note_said(plant)  # what was said of it before is not said again
 
     def _write_finals(self, finalised: Iterable[FinalisedPlant]) -> list[Entry]:
-        """Return entries with final estimates: of rows that are final now and received a measurement."""
+        """Return entries to publish with final estimates: of rows now too old to change, if they have measurements."""
         rows = [(each.plant, row) for each in finalised for row in each.final if row.has_data()]
         names = (plant.name for plant, _ in rows)
         return [*map(Entry._make, zip(names, repeat("final"), self._write_estimates(b"final", rows)))]
 
     def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
-        """Yield a refusal of each event that was used before its clock turned out wrong."""
+        """Yield a refusal of each event of a plant that was used before its clock turned out wrong (LEAPT)."""
         for node, sequence, time in events:
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             parts = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}

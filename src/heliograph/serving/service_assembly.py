@@ -154,12 +154,15 @@ async def _serve_exactly(parts: dict[int, _ServedPart], leases: PartLeases, serv
 
 
 def _drop_ended(parts: dict[int, _ServedPart]) -> None:
-    """Remove the parts whose service ended by itself; raise what it failed with, unless another process took it."""
+    """Remove the parts of the plants whose service ended by itself; raise what it failed with.
+
+    Where another process took the part over, that is only logged. `parts`: by number, those that are served here.
+    """
     for number, part in list(parts.items()):
         if part.work.done():
             del parts[number]
             try:
-                part.work.result()
+                part.work.result()  # raises what the service raised
             except TakenOverError as error:
                 LOG.warning("%s", error)
 
@@ -192,7 +195,7 @@ async def _compile_steps(network: Network) -> NetworkProgram | None:
 
 
 def _log_to_stderr() -> None:
-    """Say what happens to connections on the standard error, unless the program has said where its log goes."""
+    """Log what happens to connections on the standard error, unless the program has said where its log goes."""
     if not LOG.handlers and not logging.getLogger().handlers:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("heliograph: %(message)s"))
@@ -257,7 +260,7 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
 def _choose_patience(fleet: Fleet) -> float | None:
     """Return after how many seconds without a message its silence is used; None where silence says nothing.
 
-    That is after a step, where steps have a length; else as soon as may be, where nodes have a timeout.
+    That is after a step, where steps have a length; else SHORTEST, where nodes have a timeout (inf: none has).
     """
     if fleet.options.step is not None:
         return max(fleet.options.step, SHORTEST)
@@ -265,14 +268,17 @@ def _choose_patience(fleet: Fleet) -> float | None:
 
 
 def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Transport:
-    """Return the transport of all plants: a broker, or standard input and output; with single states if asked for."""
+    """Return what brings messages and takes outputs, of all plants: a broker, or standard input and output.
+
+    With single states published beside it if asked for. `reader`: of messages in other forms than our own.
+    """
     if settings.broker is None:
         return _add_states(settings, _open_pipe(settings, reader))
     return _add_states(settings, make_transport(settings.broker, translator=reader))
 
 
 def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
-    """Return the transport with single states published beside it, where that is asked for."""
+    """Return the transport with each state published by itself beside it, on MQTT, where that is asked for."""
     if settings.states is None:
         return transport
     from heliograph.serving.brokers.state_topics import StatePublishing

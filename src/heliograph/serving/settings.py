@@ -93,7 +93,7 @@ class ServiceSettings:
             self._check_sharing()
 
     def _check_sharing(self) -> None:
-        """Raise ValueError if something asked for does not go with processes that share the plants in parts."""
+        """Raise ValueError if something asked for does not go with --parts: processes that share the plants."""
         if self.states is not None:
             raise fail("--states", "one process, whose end says offline (no --parts)", "--parts")
         if self.store is None or self.broker is None:
@@ -105,7 +105,8 @@ class ServiceSettings:
 def choose_store_location(network: str, given: str | None, parts: int | None, node: str | None = None) -> str | None:
     """Return the path or URL of the store: `given`, else a file in this folder named after the network and its node.
 
-    None keeps no state. Processes that share `parts` have no such default, and must all name the store.
+    None, for "none" (NOTHING), keeps no state. Processes that share the plants in `parts` have no such default: they
+    must all name the store.
     """
     if given is not None or parts is not None:
         return None if given == NOTHING else given
@@ -144,7 +145,8 @@ def settings_of_node(settings: ServiceSettings, node: str) -> ServiceSettings:
 def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float | None]:
     """Return the sources of a node's own messages, by topic (None: it has none), and the seconds of a step.
 
-    The latter are those of all nodes, as any source says them; else as the settings have them.
+    A source says how a topic's messages are read; what is no mapping of them, as None, is left to others to judge. The
+    step is that of all nodes, as any source says it; else as the settings have it.
     """
     sources, step = settings.sources, settings.options.step
     if not isinstance(sources, Mapping):
@@ -158,9 +160,10 @@ def _select_sources(settings: ServiceSettings, node: str) -> tuple[object, float
 
 
 def _is_for_node(row: object, node: str, measures: bool) -> bool:
-    """Return whether a source is for a node: its own, of the inputs, or of a node that the message names.
+    """Return whether a source (a `row`) is for a node: its own, of the inputs, or of a node that the message names.
 
-    The last is so if the node measures something. What is no Source is refused later.
+    The last, whose `node` is no text but says where in a message the name is, if the node measures something
+    (`measures`). What is no Source is refused later.
     """
     if not isinstance(row, Source) or row.node in (node, INPUTS):
         return True
@@ -173,7 +176,11 @@ def _address_below(address: Address, node: str) -> Address:
 
 
 def name_of_network(network: str) -> str:
-    """Return the name of a network: of `my_network.py` or of a module, and of the one among several there."""
+    """Return a name for files of a network, which is given as `my_network.py` or module `a.my_network`: my_network.
+
+    With `:name` behind, which chooses one of several networks there, "-name" follows. A colon before what is no name,
+    as in a path, is part of the file.
+    """
     prefix, _, name = network.rpartition(":")
     file, name = (prefix, f"-{name}") if name.isidentifier() and prefix else (network, "")
     stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]

@@ -45,7 +45,7 @@ class SilenceWatch:
     def __init__(self, fleet: Fleet, every: float | None):
         """Begin with nothing published; `every`: seconds after which an estimate is published again; None for never."""
         self.fleet, self.every = fleet, every
-        self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last
+        self._begun, self._looked = monotonic(), -inf  # when this started, and when timeouts were looked for last, s
         self._published: dict[str, PublishedEstimate] = {}  # by plant, the newest
         self._resumed = set[str]()  # plants of before this start, of which messages may wait somewhere
         # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance, which is row by row.
@@ -60,7 +60,10 @@ class SilenceWatch:
         self._resumed.update(names)
 
     def find_plants_due(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
-        """Return the plants of which another step has begun by now without a message, with its number."""
+        """Return the plants of which another step has begun by now without a message, with its number.
+
+        Only where steps have a length, and senders decide when to send: their silence then says something.
+        """
         step, due = self.fleet.options.step, list[tuple[PlantState, float]]()
         if step is None or not self.fleet.deciding:
             return due
@@ -75,9 +78,9 @@ class SilenceWatch:
         return due
 
     def find_plants_overdue(self, plants: Iterable[PlantState], now: datetime) -> list[tuple[PlantState, float]]:
-        """Return the plants of which a sender has been silent for longer than its timeout since it was told last.
+        """Return the plants of which a sender is silent for longer than its timeout, and was not when last published.
 
-        With the present moment by the clock: its step, or the time where time is continuous.
+        With the present moment by the clock, from the plant's origin: its step, or seconds where time is continuous.
         """
         if self.fleet.shortest_timeout == inf:
             return []
@@ -92,15 +95,19 @@ class SilenceWatch:
         return found
 
     def looks_between_batches(self, lag: float) -> bool:
-        """Return whether to look for timeouts after a batch that came so many seconds late: once a second, if in time.
+        """Return whether to look for timeouts after a batch: once in SHORTEST, a second, if messages are in time.
 
-        Where messages wait for longer than a timeout, a sender is silent since its messages wait.
+        `lag`: age of the batch's oldest message, s. Where messages wait for longer than a timeout (steps, or s), a
+        sender only seems silent. Without any timeout (inf) there is nothing to look for.
         """
         in_time = lag < self.fleet.shortest_timeout * (self.fleet.options.step or 1.0) < inf
         return in_time and monotonic() > self._looked + SHORTEST
 
     def _iterate_dated_plants(self, plants: Iterable[PlantState]) -> Iterator[tuple[PlantState, datetime]]:
-        """Yield the plants whose time is a date's, with their origins; not those of which messages may wait."""
+        """Yield the plants whose times are dates, with their origins; not those of which messages may wait.
+
+        These are the plants of before this start (`_resumed`), for GRACE seconds or until a message came.
+        """
         if self._resumed and monotonic() > self._begun + GRACE:
             self._resumed.clear()
         for plant in plants:
@@ -108,7 +115,7 @@ class SilenceWatch:
                 yield plant, plant.origin
 
     def note_published(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> None:
-        """Note that the estimates after these rows were published."""
+        """Note that the estimates after these rows were published, to compare with later ones: outputs, dead, time."""
         if self.fleet.watched:
             outputs = self.fleet.outputs([row.slot for _, row in rows])
             for (plant, row), output in zip(rows, outputs, strict=True):
@@ -125,7 +132,10 @@ class SilenceWatch:
         return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_worth_publishing(*pair, output)]
 
     def _is_worth_publishing(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
-        """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved."""
+        """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved.
+
+        Moved: by more than MOVED, a tenth, of the deviation as published. `output`: all filters' estimates after it.
+        """
         published = self._published.get(plant.name)
         if published is None or published.dead != self._dead_senders(plant):
             return True
@@ -150,7 +160,10 @@ class SilenceWatch:
 
 
 def find_dead_senders(fleet: Fleet, plants: Mapping[str, PlantState]) -> dict[str, list[str]]:
-    """Return the dead senders of each plant that has one."""
+    """Return the nodes whose sender is dead, silent for longer than its rule or timeout allows, by plant with one.
+
+    None where silence says nothing of any node (`watched`).
+    """
     dead = {
         name: [node for node, status in fleet.find_sender_status(plant).items() if status.dead]
         for name, plant in (plants.items() if fleet.watched else ())

@@ -39,7 +39,7 @@ Thresholds = TypeAliasType("Thresholds", tuple[Threshold, ...])
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Return the threshold that is typed as a name, a sign and a number.
+    """Return the threshold that is typed as a name, a sign and a number: a state's level, and on which side to be.
 
     Args:
         text: a name, a sign and a number, as level>30 or flow<600.
@@ -60,7 +60,7 @@ def check_threshold_names(network: Network, thresholds: Thresholds) -> None:
     """Raise ValueError unless each threshold is of a state of the network or of an output of its sensors.
 
     Raises:
-        ValueError: such a level, or any of a plant of modes, whose paths cannot be drawn.
+        ValueError: a threshold of anything else, or any of a plant of modes, whose paths cannot be drawn.
     """
     if thresholds and isinstance(first(network.plant), ModalPlant):
         raise fail("--threshold", "a plant of one law of motion, whose paths can be drawn", "a markov_plant")

@@ -59,7 +59,10 @@ class WaitingService:
         return retry_while_away(lambda: self._take_and_recall(payloads), self._stop)
 
     def _take_and_recall(self, payloads: Sequence[Payload]) -> list[Output]:
-        """Take a batch, and return also what was committed when the store went away and may not have been published."""
+        """Take a batch; return its outputs, behind those that a commit before it left, if it failed.
+
+        A store that goes away in a commit may have made it: what it then has was not published.
+        """
         before = self.service.unpublished() if self._failed else []
         try:
             outputs = self.service.take(payloads)

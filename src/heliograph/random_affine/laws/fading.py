@@ -68,7 +68,10 @@ class Rician(AbstractLaw):
         return np.asarray(np.sqrt(squared) * float(self.scale))
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2."""
+        """Return the logarithm of the gain's density (Rice's law) but for a constant.
+
+        log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)), x = g sight / scale^2, sight the direct path's gain.
+        """
         sight, scale = jnp.asarray(self.sight), jnp.asarray(self.scale)
         bessel = jax.scipy.special.i0e(g * sight / scale**2)
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
@@ -84,7 +87,8 @@ def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
 
     By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
     from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) =
-    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits.
+    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. Below: `before` is
+    L_(v-1), `now` L_v.
     """
     if twice_order % 2:
         bessel = scipy_for(x).special
@@ -113,13 +117,13 @@ class Nakagami(AbstractLaw):
         return jnp.sqrt(jax.random.gamma(key, jnp.asarray(self.shape), dtype=float) * self.power / self.shape)
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return Gamma(m + k/2) / Gamma(m) (power / m)^(k/2)."""
+        """Return E[g^k] = Gamma(m + k/2) / Gamma(m) (power / m)^(k/2), k = `order`, m = `shape` and power = E[g^2]."""
         gammaln = scipy_for(self.shape).special.gammaln
         ratio = library(self.shape).exp(gammaln(self.shape + order / 2) - gammaln(self.shape))
         return plain(ratio * (self.power / self.shape) ** (order / 2))
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Return the root of the quantile of the gamma law of g^2."""
+        """Return the gains below which the law has these probabilities: roots of the quantiles of g^2, a gamma law."""
         return np.asarray(
             np.sqrt(scipy.special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
         )
@@ -130,9 +134,9 @@ class Nakagami(AbstractLaw):
         return (2 * m - 1) * jnp.log(g) - m * jnp.square(g) / self.power
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: from 0 to a gain above which it is by less than e^-36.
+        """Return the interval that holds nearly all of the law: from 0 to a gain that it passes by less than e^-36.
 
-        A gamma variable of shape m is above m + sqrt(2 m t) + t with at most the probability e^-t; t = NATS.
+        A gamma variable of shape m, as m g^2 / power, is above m + sqrt(2 m t) + t by at most e^-t; t = NATS, 36.
         """
         xp = library(self.shape, self.power)
         largest = self.shape + xp.sqrt(2 * NATS * self.shape) + NATS
@@ -172,7 +176,7 @@ class LogNormal(AbstractLaw):
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: within 9 deviations of its logarithm."""
+        """Return the interval that holds nearly all of the law: within 9 deviations of the gain's logarithm."""
         xp = library(self.log_mean, self.log_deviation)
         reach = 9 * self.log_deviation
         return xp.exp(self.log_mean - reach), xp.exp(self.log_mean + reach)

@@ -33,7 +33,7 @@ class GainLawGivenReading(AbstractLaw):
         raise fail("a gain given its reading", "a law that can be sampled", "mean and variance alone")
 
     def moment(self, order: int) -> jax.Array:
-        """Return E[g^order | a] up to the second."""
+        """Return E[g^order | a] of the gain g given its reading a, from mean and variance: up to the second."""
         if order > 2:
             raise fail("moments of a gain given its reading", "at most order 2", order)
         powers = jnp.stack([jnp.ones(()), jnp.asarray(self.mean), self.variance + jnp.square(self.mean)])
@@ -41,7 +41,7 @@ class GainLawGivenReading(AbstractLaw):
 
 
 def require_density(law: AbstractLaw) -> AbstractLaw:
-    """Return a law of which readings can be used: one with a density, or of finitely many values.
+    """Return a gain's law if readings of the gain can be used: one with a density, or of finitely many values.
 
     Raises:
         ValueError: another law, probabilities that are uncertain.
@@ -66,6 +66,7 @@ def gain_given_reading(law: AbstractLaw, reading: Float[Array, ""], variance: Fl
     """
     if isinstance(law, Constant):
         return law
+    # A NaN is no reading: computed with 0 in its place, and then not used.
     known = ~jnp.isnan(reading)
     a = jnp.where(known, reading, 0.0)
     if isinstance(law, Discrete):
@@ -100,7 +101,10 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:
-        """Return log p(t | a) but for a constant: the law's density in t, and the reading's."""
+        """Return log p(t | a) but for a constant: the law's density in t, and the reading's, a = g + e.
+
+        The gain is g = e^t of a `logarithmic` law, else t^4; `deviation`: of e.
+        """
         g = to_gain(t)
         stretch = t if law.logarithmic else 3 * jnp.log(t)  # log dg/dt, but for a constant
         return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2
@@ -126,11 +130,11 @@ LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return where a density with one mode in [low, high] is largest: at a grid's best point, refined about it."""
+    """Return where a density with one mode in [low, high] is largest: at the best of GRID points, ZOOMS times finer."""
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the neighbours of the best point of a grid between these ends."""
+        """Return the neighbours of the best point of a grid between these ends; `steps`: its points from 0 to 1."""
         left, right = ends
         points = left + (right - left) * steps
         best = jnp.argmax(jax.vmap(log_density)(points))
@@ -153,7 +157,10 @@ def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the cell of a grid in which the density rises above `least`, from the outer end to the inner one."""
+        """Return the cell of a grid in which the density rises above `least`: its outer end and its inner one.
+
+        `steps`: the grid's points, from 0 at the outer end to 1 at the inner one, where the density is above.
+        """
         outside, inside = ends
         points = outside + (inside - outside) * steps
         is_above = (jax.vmap(log_density)(points) > least).at[-1].set(True)
@@ -196,7 +203,7 @@ def gain_quadrature(
 def reading_quadrature(
     law: AbstractLaw, variance: float
 ) -> tuple[Float[np.ndarray, "nodes 1"], Float[np.ndarray, " nodes"]]:
-    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum.
+    """Return readings a = g + e (nodes, 1) and weights (nodes,) by which a mean over a reading is a sum (quadrature).
 
     Args:
         law: of the gain g, as `gain_quadrature` takes it.

@@ -164,7 +164,10 @@ class Discrete(AbstractLaw):
         return (-self.maximise_mean(-powers), self.maximise_mean(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
-        """Decide whether another law has the same values, and its probabilities stay within the radius."""
+        """Decide whether all that another law may be is possible under this one: same values, probabilities in reach.
+
+        The radius is how far each probability may be off.
+        """
         if not isinstance(own, Discrete) or not equal_to_rounding(self.values, own.values):
             return are_same(self, own)
         return within(own.probabilities, own.radius, self.probabilities, self.radius)
@@ -176,8 +179,8 @@ class Discrete(AbstractLaw):
     def maximise_mean(self, payoff: ArrayLike) -> float:
         """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
-        Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the
-        fractional knapsack, which solves this linear programme).
+        |dp_i| is at most the radius. Start with every probability at its lower end and give the mass that is left to
+        the largest payoffs first (the fractional knapsack, which solves this linear programme).
         """
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)
@@ -281,7 +284,7 @@ class GivenMoments(AbstractLaw):
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
         self.moments = array("gain moments", moments, (None,))
-        if is_traced(self.moments):
+        if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return
         sequence = np.concatenate([[1.0], self.moments])
         half = (len(sequence) - 1) // 2
@@ -297,7 +300,7 @@ class GivenMoments(AbstractLaw):
         raise fail("simulating a gain known by its moments only", "a law that can be sampled", "GivenMoments")
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return the given E[g^order]."""
+        """Return E[g^order] of the gain g, one of the given moments; raise ValueError above these."""
         if order == 0:
             return 1.0
         if order > len(self.moments):

@@ -33,7 +33,7 @@ class DisturbedGain(NamedTuple):
         return covariance
 
     def spreads(self) -> np.ndarray:
-        """Return the matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A.
+        """Return the matrices X_j with E[(H - EH)' A (H - EH)] = sum_j X_j' A X_j for every A, for H (m, c).
 
         They are the eigenvectors of the covariance of H's entries, in units of each entry, times the roots of their
         eigenvalues; as many as its rank, so none where nothing is random.
@@ -49,7 +49,10 @@ class DisturbedGain(NamedTuple):
         return factors
 
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
-        """Return the moments of this map and one after it: [G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2]."""
+        """Return the moments of this map and one after it: [G2, N2] diag([G1, N1], I) = [G2 G1, G2 N1, N2].
+
+        G takes the signal, N the disturbances; those of the other map, as many as I is long, are passed on.
+        """
         identity = np.eye(other.disturbances)
         passed = stack_on_shared_inputs(
             [self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0
@@ -60,6 +63,8 @@ class DisturbedGain(NamedTuple):
 
 def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> np.ndarray:
     """Return a root N (m, rank) of a noise's covariance, N N' = covariance, each column of a sum that is not negative.
+
+    A worst-case disturbance d makes N d of the noise, which must include its mean.
 
     Raises:
         ValueError: a mean of the noise that N cannot make.
@@ -77,7 +82,10 @@ def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m
 
 
 def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray) -> DisturbedGain:
-    """Return the joint moments of [g A, N] of a hop, from E[g] and E[g^2] of its gain g."""
+    """Return the joint moments of H = [g A, N] of a hop: `gain` A, `root` N of its noise, `moments` E[g] and E[g^2].
+
+    With H = g S + F, S = [A, 0] and F = [0, N]: E[H_ab H_ij] = E[g^2] S S + E[g] (S F + F S) + F F, at ab and ij.
+    """
     scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
     first, second = moments
@@ -90,7 +98,7 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
 def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
     """Return the moments of a map drawn from `parts` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
 
-    The noises of each part stand in columns of their own.
+    The first `inputs` columns of H take the signal; the noises of each part stand behind, in columns of their own.
     """
     widened = [_place_columns(gain, inputs, parts, i) for i, gain in enumerate(parts)]
     mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
@@ -99,7 +107,10 @@ def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts
 
 
 def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGain], index: int) -> DisturbedGain:
-    """Return the same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
+    """Return the same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn.
+
+    `index`: which of the parts the map is; in the columns of the others it is zero.
+    """
     private_widths = [p.mean.shape[1] - shared for p in parts]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
@@ -111,8 +122,9 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 
 
 def stack_on_shared_inputs(parts: Sequence[DisturbedGain], shared: int) -> DisturbedGain:
-    """Return the moments of independent maps one above the other that share their first `shared` inputs.
+    """Return the moments E[H] and E[H_ab H_ij] of independent maps one above the other, with common first inputs.
 
+    The first `shared` columns of each map take these; its other columns are its own noises'.
     Between rows of two maps E[H_ab H_ij] is the product of the means.
     """
     placed = [_place_columns(gain, shared, parts, i) for i, gain in enumerate(parts)]

@@ -14,7 +14,10 @@ Interval = tuple[Entries, Entries]
 
 
 def multiply_matrices(second: Interval, first: Interval) -> Interval:
-    """Return the interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
+    """Return the interval (lowest, highest) of each entry of a matrix product, from those of its factors.
+
+    By centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1).
+    """
     c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
     c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
     size = library(c1, c2).abs
@@ -24,6 +27,8 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
 
 def multiply_interval_polynomials(a: Entries, first: int, b: Entries, second: int, variables: int) -> Entries:
     """Return the interval product of two polynomials: ends of the products of ends, summed over equal monomials.
+
+    Homogeneous ones, of degree `first` and `second` in so many variables.
 
     Shapes: a (ends, n), b (ends, m), with one pair of ends, or (n,) where they are one.
     """

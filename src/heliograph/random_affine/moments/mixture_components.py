@@ -29,13 +29,16 @@ class AffineComponent(NamedTuple):
     noise: Array
 
     def then(self, other: "AffineComponent") -> "AffineComponent":
-        """Compose with a map after it: G_y (G_x s + c_x + n_x) + c_y + n_y."""
+        """Return this map x and a map y after it as one: G_y (G_x s + c_x + n_x) + c_y + n_y.
+
+        c are offsets and n noises, given by their covariances; the probability of both is the product of the weights.
+        """
         weight, gain, offset, noise = other
         spread = gain @ self.noise @ gain.T + noise
         return AffineComponent(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, spread)
 
     def above(self, other: "AffineComponent") -> "AffineComponent":
-        """Stack on another map of the same input."""
+        """Return this map above an independent one of the same input: with the product of their probabilities."""
         gain, offset = (
             _concatenate_first_axis(self.gain, other.gain),
             _concatenate_first_axis(self.offset, other.offset),
@@ -60,14 +63,14 @@ class NoiseAtom(NamedTuple):
 
 
 def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
-    """Combine every atom of each independent part with every one of the others.
+    """Return every atom (a possible value with its probability) of each independent part, joined with all others'.
 
     Raises:
         ValueError: more combinations than COMPONENT_LIMIT.
     """
 
     def pairs(a: list[Atom], b: list[Atom]) -> list[Atom]:
-        """Return every atom of a joined with every atom of b; raise ValueError of too many."""
+        """Return every atom of a joined with every atom of b; raise ValueError of more than COMPONENT_LIMIT."""
         if len(a) * len(b) > COMPONENT_LIMIT:
             raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
         return [join(x, y) for x in a for y in b]
@@ -100,9 +103,12 @@ class SignalNoise(NamedTuple):
 
 
 def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
-    """Return the components of several laws one above the other, as many branches each as the one with most has."""
+    """Return the components of several noises one above the other, as many branches each as the one with most has.
+
+    A branch is a Gaussian law of which a component is a mixture; those that are added have the probability 0.
+    """
     xp, most = library(parts), max(law.mean.shape[1] for law in parts)
-    fills = (-np.inf, 0.0, 1.0)
+    fills = (-np.inf, 0.0, 1.0)  # of the logarithm of the probability, the mean and the variance
 
     def padded(law: GaussianBranches) -> list[Array]:
         """Return the arrays of a law with branches of no probability, up to the largest number."""

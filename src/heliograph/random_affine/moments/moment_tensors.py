@@ -17,7 +17,7 @@ def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
 
 
 def drop_constant(tensor: Tensor) -> Tensor:
-    """Return the tensor without its last row and column, those of the constant 1."""
+    """Return the tensor with zeros in the last row and column of its last two axes, those of the constant 1."""
     signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
     signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
     return signal_part

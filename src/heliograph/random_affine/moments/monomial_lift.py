@@ -59,7 +59,8 @@ class Lift(AbstractMapWrapper):
     def moments(self, order: int) -> JointMoments:
         """Return the moments of this order of the lifted map, out of those of order degree x order of the map.
 
-        A monomial of degree degree x order is a product of `order` lifted inputs in several ways: each gets its share.
+        A monomial of degree degree x order is a product of `order` lifted inputs in several ways: each gets an equal
+        share of its coefficient.
         """
         check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
@@ -80,7 +81,10 @@ class Lift(AbstractMapWrapper):
 
 
 def _find_product_positions(variables: int, degree: int, order: int) -> np.ndarray:
-    """Return the position of each product of `order` monomials of `degree` among the monomials of degree * order."""
+    """Return the position of each product of `order` monomials of `degree` among the monomials of degree * order.
+
+    The products are listed as `list_exponents` lists the powers of the monomials of `degree`.
+    """
     parts = list_exponents(variables, degree)
     target = position(variables, degree * order)
     return np.array([

@@ -28,7 +28,10 @@ Numbers = Any  # NumPy's or JAX's, or a list of such
 
 @cache
 def list_exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
-    """Return the exponents of all monomials of total degree `degree`; degree 1 gives y_1, ..., y_p, 1."""
+    """Return the exponents of all monomials of total degree `degree`, of which degree 1 gives y_1, ..., y_p, 1.
+
+    The last of the `variables` is the constant 1, so that monomials of lower degree in y are among these.
+    """
     monomials = []
     for choice in combinations_with_replacement(range(variables), degree):
         powers = [0] * variables
@@ -51,7 +54,10 @@ def count_monomials(variables: int, degree: int) -> int:
 
 @cache_arrays
 def factor_variables(variables: int, degree: int) -> np.ndarray:
-    """Return the variables that each monomial of `list_exponents` multiplies, in order: (count, degree)."""
+    """Return the numbers of the variables that each monomial multiplies, as y_0 y_0 y_2: (monomials, degree).
+
+    Monomials, and variables in each, in the order of `list_exponents`.
+    """
     choices = combinations_with_replacement(range(variables), degree)
     flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
     return flat.reshape(count_monomials(variables, degree), degree)
@@ -60,8 +66,8 @@ def factor_variables(variables: int, degree: int) -> np.ndarray:
 def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
     """Return the position of each monomial in `list_exponents`, from the variables (..., degree) that it multiplies.
 
-    These may be in any order. Before variables s_1 <= s_2 <= ... stand, for each t, those with the same first ones and
-    a smaller t-th.
+    These may be in any order. Sorted, s_1 <= s_2 <= ..., the monomial stands behind those that, for some t, have the
+    same variables before the t-th, and a smaller t-th.
     """
     ordered = np.sort(chosen, axis=-1)
     before = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
@@ -75,14 +81,17 @@ def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
 
 
 def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
-    """Raise if a moment matrix would need more than the stated memory."""
+    """Raise ValueError if a moment matrix, named `what`, would have more than MEMORY_LIMIT_ENTRIES."""
     if rows * columns > MEMORY_LIMIT_ENTRIES:
         got = f"{rows * columns:,} entries; use a lower order, or fewer states, outputs or stacked sensors at once"
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
 
 
 def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
-    """Return all monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
+    """Return the values of all monomials of (y, 1) of total degree `degree`, for y of shape (p,).
+
+    NumPy's where y is, else JAX's.
+    """
     values: list[Numbers] = [*y, 1.0]
     terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
              for powers in list_exponents(len(values), degree)]  # fmt: skip
@@ -95,7 +104,10 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
 
 @cache_arrays
 def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
-    """Return at [i, c] the position at degree - 1 of monomial i over variable c; one past the end if it has no c."""
+    """Return at [i, c] the position, among monomials of degree - 1, of monomial i divided by variable c.
+
+    One past the end if it has no c: a place for a zero.
+    """
     lower = position(variables, degree - 1)
     table = np.full((count_monomials(variables, degree), variables), len(lower), dtype=np.int64)
     for i, powers in enumerate(list_exponents(variables, degree)):
@@ -107,7 +119,7 @@ def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
 
 @cache_arrays
 def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
+    """Return for each monomial the last variable that divides it, and the quotient's position at degree - 1."""
     table = _tabulate_quotient_positions(variables, degree)
     divisor = np.array(
         [max(c for c, power in enumerate(powers) if power) for powers in list_exponents(variables, degree)]
@@ -118,8 +130,8 @@ def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np
 def symmetric_power(h: Numbers, degree: int) -> Numbers:
     """Return Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
 
-    Row of z_a z_b...: the product of linear forms, built degree by degree,
-    S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c]. Works on NumPy and on JAX arrays.
+    H (m + 1, p + 1) takes Y = (y, 1) to Z = (z, 1). Row a, a monomial z_i z_j ..., is a product of linear forms, built
+    degree by degree: S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c], for any z_i in a. On NumPy and on JAX arrays.
 
     Shapes: (m + 1, p + 1) -> (C(m + k, k), C(p + k, k)).
     """
@@ -129,13 +141,13 @@ def symmetric_power(h: Numbers, degree: int) -> Numbers:
     for k in range(2, degree + 1):
         divisor, parent = _find_dividing_variable(outputs, k)
         table = _tabulate_quotient_positions(inputs, k)
-        padded = _append_zero_column(power)[parent]
+        padded = _append_zero_column(power)[parent]  # zero for g / y_c where g has no y_c
         power = sum(h[divisor, c][:, None] * padded[:, table[:, c]] for c in range(inputs))
     return power
 
 
 def _append_zero_column(a: Numbers) -> Numbers:
-    """Return the matrix with a column of zeros more, by NumPy or JAX."""
+    """Return the matrix with a column of zeros behind the others, by NumPy or JAX, whichever it is of."""
     if isinstance(a, np.ndarray):
         return np.pad(a, ((0, 0), (0, 1)))
     import jax.numpy as jnp
@@ -145,7 +157,10 @@ def _append_zero_column(a: Numbers) -> Numbers:
 
 @cache_arrays
 def product_table(variables: int, first: int, second: int) -> np.ndarray:
-    """Return the entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
+    """Return at (i, j) the position, among monomials of degree first + second, of the product of monomials i and j.
+
+    Monomial i is of degree `first`, j of degree `second`.
+    """
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
     both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
@@ -166,7 +181,11 @@ def degrees(dimension: int, order: int) -> np.ndarray:
 
 @cache_arrays
 def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
+    """Return (y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b).
+
+    For all monomials a of (y, 1) of this order, y of `dimension`. Places are among these: b and a - b are times powers
+    of 1.
+    """
     places, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
@@ -200,6 +219,7 @@ class JointMoments(Module):
     @property
     def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
         """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); order 2."""
+        # Where the monomials z_i z_j and Y_a Y_b stand in the matrix.
         rows = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
         columns = product_table(self.inputs + 1, 1, 1)
         shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
@@ -207,7 +227,7 @@ class JointMoments(Module):
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
-        """Return E[Sym^order(H)] of a lower order, whose monomials are among these."""
+        """Return E[Sym^order(H)] of a lower order: times powers of 1, its monomials are among those of `self.order`."""
         places = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
         matrix: jax.Array | np.ndarray = self.matrix[places]
         return matrix
@@ -231,7 +251,7 @@ def times_one(variables: int, low: int, high: int) -> np.ndarray:
 
 
 def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
-    """Return a map's method `moments`, which may give a matrix alone, as one that gives `JointMoments`.
+    """Return a map's method `moments` (`written`), which may give a matrix alone, as one that gives `JointMoments`.
 
     Raises:
         ValueError: a matrix whose shape is not that of the map's monomials.
@@ -239,7 +259,7 @@ def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], Joi
 
     @wraps(written)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from what the map's own method returns: these, or their matrix."""
+        """Return the moments of this order, from what the map's own method, `written`, returns: they or a matrix."""
         result = written(channel, order)
         if isinstance(result, JointMoments):
             return result

@@ -61,7 +61,7 @@ class NoiseMoments(AbstractNoise):
         raise fail("simulating a noise known by its moments only", "a law that can be sampled", "NoiseMoments")
 
     def moment(self, powers: Exponents) -> Number:
-        """Return the given E[n^order]."""
+        """Return the given E[n^order]; `powers`: the order alone, since the noise has one component."""
         (order,) = powers
         if order == 0:
             return 1.0
@@ -160,7 +160,10 @@ class CentredNoise(AbstractNoise):
         return self.source.sample(key) - jnp.asarray(self.source.mean)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E prod_i (n_i - E n_i)^a_i = sum_{b <= a} prod_i C(a_i, b_i) (-E n_i)^(a_i - b_i) E[n^b]."""
+        """Return the central moment E prod_i (n_i - E n_i)^a_i of the noise `source` n, with the `powers` a.
+
+        It is sum_{b <= a} prod_i C(a_i, b_i) (-E n_i)^(a_i - b_i) E[n^b].
+        """
         total: Number = 0.0
         for b in product(*(range(a + 1) for a in powers)):
             weights = [

@@ -48,7 +48,7 @@ def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> 
 
 @push_moments.register
 def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
-    """Return E[mono(z)] of z = g A y + n from E[mono(y)].
+    """Return E of all monomials of (z, 1) of this order, z = g A y + n, from those of (y, 1), the `moments`.
 
     E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
     """
@@ -75,7 +75,9 @@ def _push_through_mixture(channel: Mixture, order: int, moments: Array1) -> Arra
 
 
 def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> Array1:
-    """Return E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
+    """Return E of all monomials of (z, 1), z = A y + b, from those of (y, 1), with H = [[A, b], [0, 1]] `homogeneous`.
+
+    Of even order they are entries of Sym(H) E[Y Y'] Sym(H)', Y the monomials of half the order: fewer numbers.
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """
@@ -134,7 +136,10 @@ def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array
 
 
 def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """Return the moments; raise unless they are those of the channel's inputs up to the order."""
+    """Return the moments; raise ValueError unless they are as many as (y, 1) has monomials of this order, y the input.
+
+    The channel must have no memory.
+    """
     check_forgets("channel of a lift", channel)
     expected = count_monomials(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):
@@ -144,7 +149,10 @@ def _read_moments(channel: AbstractRandomAffine, order: int, moments: Array1) ->
 
 @cache_arrays
 def _choose_product_places(variables: int, degree: int) -> np.ndarray:
-    """Return for each monomial of degree 2 k one place (flattened) in the table of products."""
+    """Return for each monomial of degree 2 k one place (flattened) in the table of products of two of degree k.
+
+    Of several products that give the same monomial, the last.
+    """
     table = product_table(variables, degree, degree).reshape(-1)
     places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
     places[table] = np.arange(table.size)

@@ -27,7 +27,11 @@ class QuadraticMap(Module):
     radius: Tensor
 
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
-        """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
+        """Return a matrix above the second moment of z under every possible law, at W = E (y, 1)(y, 1)'.
+
+        The entries are within radius : |W| of center : W; their row sums on the diagonal dominate any such difference
+        (Gershgorin), in a unit of each component's own. Rows and columns of components not `present` are zero.
+        """
         mask = present[:, None] & present[None, :]
         center = self.evaluate_center(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
@@ -71,7 +75,7 @@ def scale_map(part: QuadraticMap, factor: Any) -> QuadraticMap:
 
 
 def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
-    """Return the map of outputs start, start + 1, ... among all of them, zero elsewhere."""
+    """Return the map of a block of outputs as one of all `outputs`: the block from `start` on, zero elsewhere."""
     margin = (start, outputs - start - block.center.shape[0])
     widths = [margin, margin, (0, 0), (0, 0)]
     return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))

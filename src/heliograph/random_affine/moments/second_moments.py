@@ -67,7 +67,11 @@ class SecondOrder(Module):
 def describe_second_moments(
     mean: Matrix, spread: QuadraticMap, shift: QuadraticMap, power: QuadraticMap, nominal: QuadraticMap, uncertain: bool
 ) -> SecondOrder:
-    """Return second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise."""
+    """Return second moments of z = G y + n from E[(G, n)] and the maps, the nominal one divided into gain and noise.
+
+    The maps take W = E (y, 1)(y, 1)' to a second moment: of z about its nominal mean (spread), of the mean's own shift,
+    of G y (power), and the spread under the nominal law. `uncertain`: whether several laws are possible.
+    """
     gain, noise = split_off_noise(nominal.center)
     return SecondOrder(mean[:, :-1], mean[:, -1], spread, shift, power, nominal, gain, noise, uncertain)
 
@@ -82,6 +86,7 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
     corner = np.zeros(spread.shape[-2:])
     corner[-1, -1] = 1.0
+    # `corner` is where a spread has the covariance of n. Of the m columns some are zero if the covariance has fewer.
     noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
     return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
 
@@ -93,7 +98,10 @@ def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
 
 
 def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
-    """Join spread of the gain and noise columns to one spread: the inverse of `split_off_noise`."""
+    """Return the covariances of (A, n) from those of a random gain A alone and the columns of Cov n.
+
+    The inverse of `split_off_noise`: Cov n, columns times weights times columns', is added at the constant 1.
+    """
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
     corner = np.zeros(gain.shape[-2:])
@@ -103,7 +111,10 @@ def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Return whether z depends on y through more than a known gain; a traced law does where none is known."""
+    """Return whether z depends on y through more than a known gain: through a random or an uncertain one.
+
+    Of a law traced by JAX no number can be looked at: it does unless the channel says that its gain is known.
+    """
     if described.uncertain or is_traced(described.spread):
         return described.uncertain or not channel.has_known_gain
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
@@ -114,6 +125,7 @@ def has_known_mean(described: SecondOrder) -> bool:
     """Return whether E[G] and E[n] are the same under every possible law, to rounding; False for traced parameters."""
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
+    # Squared, as the shift is: a second moment of the mean's difference from the nominal one.
     size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
     largest = max(np.max(np.abs(bound), initial=0.0) for bound in (described.shift.center, described.shift.radius))
     return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
@@ -169,6 +181,7 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     same of the law's mean) and the power E[G y y' G'], which leaves out the last row and column of W. They are exact
     where the law is known.
     """
+    # Corners are the extreme ones of the possible laws; None if they are too many.
     corners = count_corners(channel)
     # A single corner: nothing is uncertain.
     if corners == 1:
@@ -232,7 +245,10 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
 
 
 def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
-    """Return a spread in which that of known gains is zero, where a difference of moments leaves rounding."""
+    """Return a spread in which that of known gains is zero, where a difference of moments leaves rounding.
+
+    The spread (m, m, p + 1, p + 1): the covariance of the entries of (G, n), z = G y + n, at [i, j, a, b].
+    """
     random = ~channel.known_gains
     varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
     cleaned: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
@@ -278,7 +294,10 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
 
 
 def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
-    """Return mean and spread of a map of known law: of independent maps the spreads of each alone, and no more."""
+    """Return mean and spread of a map z = G y + n of known law: of independent maps from those of each alone.
+
+    The mean is E[(G, n)] (m, p + 1), the spread [i, j, a, b] the covariance of its entries (i, a) and (j, b).
+    """
     if not isinstance(channel, Superposed | Stack):
         moments = channel.moments(2)
         mean = moments.mean[:-1]
@@ -294,19 +313,22 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
-    """Return Cov(z | y) of a channel of known gain, as that of its parts where these are independent."""
+    """Return Cov(z | y) of a channel of known gain: its noise's; of a stack or a sum from those of its maps."""
     covariance: Matrix
     if isinstance(channel, Stack):
         covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])
     elif isinstance(channel, Superposed):
         covariance = sum((_noise_covariance(affine) for affine in channel.maps), channel.noise.covariance)
     else:
-        covariance = _compute_mean_and_spread(channel)[1][..., -1, -1]
+        covariance = _compute_mean_and_spread(channel)[1][..., -1, -1]  # the spread's entry at the constant 1
     return covariance
 
 
 def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
-    """Return the spreads of independent maps side by side, as diagonal blocks of that of all outputs."""
+    """Return the spreads of independent maps side by side, as diagonal blocks of that of all outputs.
+
+    A spread (m, m, p + 1, p + 1) is the covariance of the entries of (G, n), z = G y + n; y is the same for all maps.
+    """
     sizes, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
     outputs = sum(sizes)
     # Places of the blocks' entries (i, j) in the flat (outputs, outputs).
@@ -363,7 +385,10 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
 
 
 def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Return the weighted sum of the maps of parts, each at the places of what its part takes."""
+    """Return the weighted sum of second-moment maps, each put at the places in (y, 1) of what its part takes.
+
+    `weighted`: by the number of a part (a map that the channel sums), its second-moment map and its weight.
+    """
     parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
     center = channel.sum_in_places({i: part.center for i, part in parts.items()}, 2)
     return QuadraticMap(center, channel.sum_in_places({i: part.radius for i, part in parts.items()}, 2))

@@ -40,7 +40,10 @@ class ChannelPosition(NamedTuple):
         return list(zip(maps, at, strict=True))
 
     def select_components(self, places: Sequence[int]) -> "ChannelPosition":
-        """Return the position at a map that takes the components at these places."""
+        """Return the position at a map that takes the components of y at these places: its signal has these alone.
+
+        The last entry of E (y, 1)(y, 1)', of the constant, stays.
+        """
         if self.signal is None:
             return self
         chosen = np.array([*places, -1])
@@ -49,7 +52,8 @@ class ChannelPosition(NamedTuple):
     def on_delay_line(self, times: int) -> "ChannelPosition":
         """Return the position at a map of the line (y_k, y_{k-1}, ...) of so many signals.
 
-        Each is as the present one; a delay chooses one of them, so no two meet.
+        Each has the moments of the present one. What they have between them is left out (zero): a delay chooses one
+        signal, so no two meet.
         """
         if self.signal is None:
             return self
@@ -60,7 +64,7 @@ class ChannelPosition(NamedTuple):
 
 
 def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMoment:
-    """Return E h Y h' behind a random map h, by its second moments, and its mean."""
+    """Return E (z, 1)(z, 1)' behind a random map, by its mean and second moments, from E (y, 1)(y, 1)' before it."""
     second, tensor = signal.second, moments.second
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
     behind = xp.block([[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])

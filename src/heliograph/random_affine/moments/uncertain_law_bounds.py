@@ -19,7 +19,10 @@ PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from di
 
 
 def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the spread about the nominal mean H0, shift of the mean, and power, all of one law."""
+    """Return the spread about the nominal mean H0, shift of the mean, and power, all of one possible law.
+
+    Maps of (y, 1)(y, 1)', for (G, n) of z = G y + n: of second moments of (G, n) - H0, of its mean - H0, and of G y.
+    """
     raw = moments.second
     law_mean = moments.mean[:-1]
     spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
@@ -33,6 +36,7 @@ def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
     s_v and that noise; else the middle of the range of each entry, with half the range as radius.
     """
     xp = library(tensors)
+    # `holds`: whether `exact`, the map of the largest s_v and noise, is above all.
     low, high = tensors.min(axis=0), tensors.max(axis=0)
     exact, holds = _find_dominating_tensor(tensors, mean)
     return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
@@ -70,7 +74,10 @@ def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.n
 
 
 def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
-    """Return the s_v (law,) of least squares in gains_v = s_v `shape`, and how far each entry is off it."""
+    """Return the s_v (law,) of least squares in gains_v = s_v `shape`, and how far each entry is off it.
+
+    `gains` (law, m, m, p, p): a tensor of each law v.
+    """
     xp = library(gains, shape)
     size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
@@ -78,7 +85,10 @@ def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
 
 
 def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
-    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether all N_max - N_v >= 0."""
+    """Return N_max, the covariance of the largest trace among N_v (law, m, m), and whether all N_max - N_v >= 0.
+
+    `>= 0`: positive semidefinite, to PROPORTIONAL_TOLERANCE; if any N_v is above all others it is N_max.
+    """
     xp = library(noises)
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
     # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.

@@ -57,10 +57,12 @@ class Flips(AbstractRandomAffine):
         return Discrete(1 - 2 * self.error.values, self.error.probabilities)
 
     def about_centre(self, power: Float[np.ndarray, " words"]) -> AbstractRandomAffine:
-        """Return the random affine map of q - c: gain g, and noise of variance U (1 - E g^2).
+        """Return the random affine map of q - c, words less their centre: gain g, and noise of variance U (1 - E g^2).
+
+        Where each word draws a gain of its own, it is a stack of one map a word.
 
         Args:
-            power: U of each word.
+            power: U of each word, its variance were all its values equally likely.
         """
         left = 1 - float(self.gain.moment(2))
         if self.per_message or self.dimension == 1 or isinstance(self.error, Constant):
@@ -74,13 +76,13 @@ class Flips(AbstractRandomAffine):
         return BitFlips(self.error, self.dimension, self.per_message, bits, beside)
 
     def moments(self, order: int) -> JointMoments:
-        """Refuse: what a flipped bit does depends on the words."""
+        """Refuse moments: what a flipped bit does to a word depends on the word, which only the encoder knows."""
         raise fail(
             "channel of words", "a filter that is given the encoder of the words (encoder=...)", "one that is not"
         )
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Refuse: what a flipped bit does depends on the words."""
+        """Refuse to draw: what a flipped bit does to a word depends on the word, which only the encoder knows."""
         raise fail("channel of words", "a node that has the encoder of the words (encoder=...)", "one that has none")
 
     def in_words(self) -> str:
@@ -111,7 +113,10 @@ class BitFlips(AbstractRandomAffine):
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw p, of the message or of each word, and the bits that flip."""
+        """Draw p, of the message or of each word, and the bits that flip: return the diagonal H, -1 at these, else 1.
+
+        Each word is `bits` numbers -1 or 1, and `beside` numbers behind them that never flip; the constant 1 is last.
+        """
         rate_key, bit_key = jax.random.split(key)
         if self.per_message:
             p = jnp.full(self.dimension, self.error.sample(rate_key))
@@ -162,7 +167,7 @@ def decode_and_forward(hops: Sequence[object], dimension: int = 1, per_message: 
 
 
 def _read_error_rate(rate: object) -> Constant | Discrete:
-    """Return the law of a hop's error rate."""
+    """Return the law of a hop's error rate, the probability that a bit is flipped: a number, or finitely many."""
     expected = "one number from 0 to 0.5 for all bits of the word, or a Discrete law of such numbers"
     if isinstance(rate, Discrete):
         values = np.asarray(rate.values)

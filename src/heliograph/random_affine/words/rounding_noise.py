@@ -70,6 +70,7 @@ class RoundedNoise(AbstractNoise):
         gaussian: bool = False,
         matters: bool = False,
     ):
+        # The sensor's noise; step D of the rounding, half of its range and its centre, by component; its dither.
         self.source, self.step, self.half, self.centre = source, step, half, centre
         self.dither, self.gaussian, self.matters = dither, gaussian, matters
 
@@ -97,7 +98,11 @@ class RoundedNoise(AbstractNoise):
 
     @property
     def is_exact(self) -> bool:
-        """True if Var e is known and e has mean 0 whatever the state is."""
+        """True if Var e, of the rounding's error e, is known, and e has mean 0 whatever the state is.
+
+        By the dither; `gaussian`: y is, so that its moments give Var e; `matters`: the second moment of the rounded
+        signal enters what is claimed.
+        """
         match self.dither:
             case "triangular":
                 return True
@@ -114,15 +119,20 @@ class RoundedNoise(AbstractNoise):
 
     @property
     def _dithers_itself(self) -> bool:
-        """True if v is Gaussian with a deviation of a step or more in every direction."""
+        """True if the sensor's noise v is Gaussian with a deviation of a step or more in every direction."""
         if not isinstance(self.source, Gaussian):
             return False
         step = np.asarray(self.step)
+        # The covariance in steps; DITHERLESS is 1, less rounding.
         unit = np.asarray(self.source.covariance) / (step[..., :, None] * step[..., None, :])
         return bool(np.all(np.linalg.eigvalsh(unit)[..., 0] >= DITHERLESS))
 
     def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
-        """Return v + e beside a Gaussian signal of these moments: with E f(1 - f) from its series."""
+        """Return v + e, the sensor's noise and the error of rounding, beside a Gaussian signal of these moments.
+
+        The variance of e, in steps squared: E f(1 - f) by its series, f the place of y between two steps; else `known`,
+        the largest whatever y is. `whole` is that of e with the dither, which is taken off again if subtracted.
+        """
         known = LARGEST[self.dither]
         if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
             whole = self.source.covariance + known.whole * self._squares()
@@ -133,7 +143,7 @@ class RoundedNoise(AbstractNoise):
         return SignalNoise(self._with_error(error * self.step**2), whole)
 
     def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
-        """Return an upper bound of E f (1 - f), f the place of y between two words in steps D, for y of N(m, s^2).
+        """Return an upper bound of E f (1 - f), f in [0, 1] the place of y between two words, D apart, y of N(m, s^2).
 
         Dithered rounding has the variance D^2 f (1 - f). With the lowest word `low`
 
@@ -150,7 +160,7 @@ class RoundedNoise(AbstractNoise):
         return jnp.clip(share, 0.0, 0.25)
 
     def _squares(self) -> Square:
-        """Return diag(D^2), the squares of the steps on a diagonal."""
+        """Return diag(D^2), the squares of the steps D of rounding on a diagonal."""
         xp = library(self.step)
         squares: Square = xp.asarray(self.step)[..., :, None] ** 2 * np.eye(self.dimension)
         return squares
@@ -184,7 +194,7 @@ class RoundedNoise(AbstractNoise):
         return self.source.sample(key) - jnp.asarray(self.centre)
 
     def moment(self, powers: Exponents) -> Number:
-        """Refuse moments above the second, which depend on the signal.
+        """Return the mean or second moment of the components that the powers choose; higher ones depend on the signal.
 
         Raises:
             ValueError: a third or higher moment.

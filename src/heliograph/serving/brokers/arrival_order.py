@@ -36,12 +36,16 @@ class ArrivalOrder:
     """
 
     def __init__(self, source: str, steps: bool) -> None:
+        # Name of the file, for errors; whether times that are numbers are steps.
         self._source, self._steps = source, steps
         self._held = list[HeldPayload]()  # a heap
         self._count, self._last = 0, float("-inf")  # of all payloads so far; moment of the newest
 
     def add_messages(self, payloads: Sequence[Payload]) -> list[Payload]:
-        """Take messages; return those that no longer wait, since more than HELD would."""
+        """Take messages; return the earliest of those that wait, as many as are more than HELD.
+
+        A heap orders them by moment, and by their count where moments are equal.
+        """
         results = list[Payload]()
         for payload in payloads:
             self._last = self._find_moment(payload)
@@ -54,7 +58,7 @@ class ArrivalOrder:
         return results
 
     def take_rest(self) -> list[Payload]:
-        """Return all messages that still wait, in order."""
+        """Return all messages that still wait, in order; refuse those whose clock was never set, if all still wait."""
         if self._count == len(self._held):  # all are here, so that times can be compared with all others
             self._refuse_unset_times()
         return [heappop(self._held).payload for _ in range(len(self._held))]
@@ -79,7 +83,10 @@ class ArrivalOrder:
                 self._held[self._held.index(entry)] = entry._replace(payload=error)
 
     def _find_moment(self, payload: Payload) -> float:
-        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before."""
+        """Return when a payload arrived, or else was measured; for what is no message, the moment of the one before.
+
+        In seconds since 1970, or as the number that it has.
+        """
         message = payload.read if isinstance(payload, UnreadMessage) else payload
         if not isinstance(message, Message | NumberedMessage):
             return self._last

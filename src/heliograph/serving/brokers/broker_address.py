@@ -44,7 +44,8 @@ class Address:
     def tls(self) -> ssl.SSLContext | None:
         """Return the TLS context, with the system's authorities or those of the file SSL_CERT_FILE; None if not secure.
 
-        A client certificate is read from the files that HELIOGRAPH_BROKER_CERTIFICATE and HELIOGRAPH_BROKER_KEY name.
+        A client certificate is read from the files that HELIOGRAPH_BROKER_CERTIFICATE (here CERTIFICATE) and
+        HELIOGRAPH_BROKER_KEY (KEY) name.
         """
         if not self.secure:
             return None
@@ -97,7 +98,7 @@ def parse_address(url: str, environment: Mapping[str, str] | None = None) -> Add
 
 
 def _check_topic(topic: str) -> str:
-    """Return a topic if its words are valid in MQTT and NATS; raise ValueError otherwise."""
+    """Return a topic if its words are valid in MQTT and NATS, whose topics have dots and wildcards; else ValueError."""
     if any(sign in topic for sign in "*>+#.$ ") or not topic.isprintable():
         raise fail("broker, topic", "words between slashes, without . * > + # $ and spaces", topic)
     return topic

@@ -78,6 +78,7 @@ class LineReader:
             ValueError: a table whose header names no columns, or others than expected; one line.
         """
         payloads, rows = list[Payload](), list[str]()
+        # `_is_table` is None until a line has told: the first that names columns makes all that follow a table's.
         for line in lines:
             if self._is_table is None:
                 self._is_table = self._table.names_columns(_decode_line(line)) or None
@@ -90,7 +91,10 @@ class LineReader:
         return payloads if self._order is None else self._order.add_messages(payloads)
 
     def end(self) -> list[Payload]:
-        """Return the messages that are left when no more lines come."""
+        """Return the messages that are left when no more lines come: of a table or an unfinished document.
+
+        With those of a file that waited for earlier ones (`_order`).
+        """
         if self._is_table:
             rest = self._table.end()
         else:
@@ -120,6 +124,7 @@ class LineReader:
         with suppress(InputError):
             found = parse_message_document(b"\n".join(lines), self.source)
             return [payload for message in found for payload in self._interpret_message(message, None)]
+        # No document: each line is read and counted (`_number`) again, as none of a table.
         self._is_table, self._number = False, self._number - len(lines)
         payloads = list[Payload]()
         for line in lines:
@@ -154,7 +159,10 @@ class LineReader:
 
 
 def redirected_file(descriptor: int) -> Path | None:
-    """Return the file that a descriptor reads, where the system says it; None of a pipe."""
+    """Return the path of the file that a descriptor reads, where the system says it; None of a pipe.
+
+    Relative to the working directory if the file is below it.
+    """
     with suppress(OSError):
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))

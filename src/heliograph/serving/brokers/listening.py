@@ -13,7 +13,7 @@ INTERNAL = ("$", "_INBOX")  # topics and subjects of the broker itself
 
 
 def listen(address: Address, seconds: float) -> dict[str, TopicStatistics]:
-    """Listen to all topics of a broker for a while, and return them; nothing is acknowledged or stored.
+    """Listen to all topics of a broker for a while, and return what came, by topic; nothing is acknowledged or stored.
 
     Args:
         address: the broker.
@@ -55,7 +55,7 @@ def _listen_mqtt(address: Address, seconds: float, topics: dict[str, TopicStatis
     answered, refusals = threading.Event(), list[str]()
 
     def subscribe(client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: Properties | None) -> None:
-        """Ask for all topics once connected, or note why the broker refuses; say that it has answered."""
+        """Ask for all topics ("#") once connected, or note why the broker refuses; set `answered` in any case."""
         if code.is_failure:
             refusals.append(str(code))
         else:

@@ -87,19 +87,19 @@ class Connection:
     def disconnected(
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
-        """Log that the connection ended, unless it was closed here."""
+        """Log that the connection ended, unless it was closed here; the client connects again by itself."""
         if self.open:
             LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
 
     def failed(self, client: Client, data: object) -> None:
-        """Report that nobody answers there, or nobody who is trusted."""
+        """Log why no connection came about: nobody answers at the address, or nobody whose certificate is trusted."""
         if self.open:
             # The client calls this where it caught the exception.
             LOG.warning("%s: %s; trying again", self.address, explain_failure(sys.exc_info()[1]))
 
     def close(self) -> None:
         """End the connection, and its thread."""
-        with self.changed:
+        with self.changed:  # wakes what waits for the broker or for room
             self.open = False
             self.changed.notify_all()
         self.client.disconnect()
@@ -124,7 +124,7 @@ class _Reader(Connection):
         self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
         self._prefix, self._translator = f"{address.topic}/in/", translator
         self._held: deque[HeldMessage] = deque()
-        self._connection = 0  # counts connections, and their ends
+        self._connection = 0  # counts connections and their ends: a message is acknowledged in its own only
         self.client.on_message = self._hold_message
         self.start()
 
@@ -146,7 +146,10 @@ class _Reader(Connection):
         return Batch(payloads, acknowledge)
 
     def _take_held(self) -> list[HeldMessage]:
-        """Return at most MOST of the messages that are held, which the client's thread may then replace by others."""
+        """Return at most MOST of the messages that are held, the oldest first.
+
+        The client's thread, which waits while too many are held, may then add others.
+        """
         with self.changed:
             batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
             if not self._held:
@@ -155,7 +158,7 @@ class _Reader(Connection):
         return batch
 
     def _read_payloads(self, message: MQTTMessage, arrival: datetime) -> Sequence[Payload]:
-        """Return a message in our form as it is, and of another topic what the sources read in it."""
+        """Return a message in our own form, below `_prefix`, as it is; of another topic what the sources read in it."""
         if self._translator is None or message.topic.startswith(self._prefix):
             return [bytes(message.payload)]
         return self._translator.read(message.topic, bytes(message.payload), arrival, message.retain)
@@ -163,14 +166,14 @@ class _Reader(Connection):
     def _acknowledge(self, batch: Sequence[HeldMessage]) -> None:
         """Acknowledge the messages of the present connection; those of an earlier connection come again.
 
-        The number of one of these may by now be that of another message.
+        The broker numbers messages in each connection: the number of an earlier one may by now be another message's.
         """
         for held in batch:
             if held.connection == self._connection:
                 self.client.ack(held.message.mid, held.message.qos)
 
     def _hold_message(self, client: Client, data: object, message: MQTTMessage) -> None:
-        """Hold a message; while too many are held, block the client's thread so that no more are read."""
+        """Hold a message, with its connection and time; while HELD are, block the client's thread: it reads no more."""
         with self.changed:
             self.changed.wait_for(lambda: len(self._held) < HELD or not self.open)
             self._held.append(HeldMessage(self._connection, message, datetime.now(UTC)))
@@ -180,7 +183,7 @@ class _Reader(Connection):
     def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
         """Subscribe to our topics and to those of the sources, after each connection anew."""
         super().connected(client, data, flags, code, more)
-        self._connection += 1
+        self._connection += 1  # messages of an earlier one are not acknowledged in this one
         if not code.is_failure:
             topics = [] if self._translator is None else self._translator.sources.subscribed_topics
             LOG.info("%s: connected", self.address)
@@ -190,7 +193,7 @@ class _Reader(Connection):
         self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
     ) -> None:
         super().disconnected(client, data, flags, code, more)
-        self._connection += 1
+        self._connection += 1  # what was received before can no longer be acknowledged
 
 
 class _Writer(Connection):
@@ -206,6 +209,7 @@ class _Writer(Connection):
         """Publish outputs; return when the broker has all that have a number. A provisional estimate may be lost."""
         sent = set()
         for output in outputs:
+            # With quality 0 a message is sent once, and nobody says whether it came.
             quality = 0 if output.kind == "provisional" else AT_LEAST_ONCE
             handle = self.client.publish(topic_of(self.address.topic, output), output.body, quality)
             if output.number is not None:
@@ -215,7 +219,7 @@ class _Writer(Connection):
             self._delivered.clear()
 
     def _note_received(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:
-        """Note that the broker has the message with this number."""
+        """Note that the broker has the message with this number, for `publish`, which waits for it."""
         with self.changed:
             self._delivered.add(number)
             self.changed.notify_all()

@@ -63,6 +63,7 @@ class Nats:
         self.address, self.part, self._translator = address, part, translator
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")
+        # The server's stream of messages and its reader, None until there is a connection.
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
@@ -99,7 +100,8 @@ class Nats:
     def _has_gap(self, messages: Sequence[Msg]) -> bool:
         """Return whether messages were lost on the way before the last of these; else count them as read.
 
-        The consumer counts what it sends. After a gap all is read again from the last message that was acknowledged.
+        The consumer, the server's side of a reader, counts what it sends. After a gap a new reader (None) reads all
+        again from the last message that was acknowledged.
         """
         count = messages[-1].metadata.sequence.consumer
         if count != self._read + len(messages):
@@ -109,7 +111,10 @@ class Nats:
         return False
 
     def _read_payloads(self, message: Msg) -> Sequence[Payload]:
-        """Return a message in our form as it is, and of another subject what the sources read in it."""
+        """Return a message in our own form as it is, and of another subject what the sources read in it.
+
+        In sources a subject is written as a topic, with / in place of dots.
+        """
         if self._translator is None or message.subject.startswith(f"{self.topic}.in."):
             return [message.data]
         return self._translator.read(message.subject.replace(".", "/"), message.data, message.metadata.timestamp)
@@ -233,7 +238,10 @@ class Nats:
         return self._reader
 
     def _configure_consumer(self) -> ConsumerConfig:
-        """Return settings of the consumer: this part's messages in order, from the first that was not acknowledged."""
+        """Return settings of the consumer: this part's messages in order, from the first that was not acknowledged.
+
+        Acknowledging one acknowledges all before it. The one process of all parts also reads the sources' subjects.
+        """
         return ConsumerConfig(
             durable_name=self._name,
             deliver_policy=DeliverPolicy.BY_START_SEQUENCE,

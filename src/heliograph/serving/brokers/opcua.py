@@ -43,7 +43,9 @@ class Reporting(NamedTuple):
     interval: float
 
     def trigger(self, heartbeat: int | None = None) -> SendOnDelta:
-        """Return the sender of a node whose steps are the sampling intervals, for `hg.Node(..., trigger=...)`.
+        """Return when a node sends, as the server does, for `hg.Node(..., trigger=...)`: at changes of the deadband.
+
+        A step is a sampling interval of the server.
 
         Args:
             heartbeat: steps after which a value is sent in any case; None for never.
@@ -128,10 +130,10 @@ class OpcUa:
         """Prepare to read a server's variables by a translator's sources; outputs go to file descriptor `target`."""
         self.address, self._translator = address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(address))
-        self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()
+        self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()  # messages of each change, not yet received
         self._client: Client | None = None
         self._first: set[str] = set()  # variables of which the first value is still to come
-        self.reporting: dict[str, Reporting] = {}
+        self.reporting: dict[str, Reporting] = {}  # deadband and interval by variable
 
     async def receive(self) -> Batch | None:
         """Wait for changes of the nodes that are subscribed to, and return what came together."""
@@ -155,7 +157,9 @@ class OpcUa:
                 await asyncio.wait_for(self._client.disconnect(), WAIT)
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Put a change of a variable into the queue, as messages; its first value was there before, as stored ones.
+        """Put a change of a variable into the queue, as messages.
+
+        Its first value was there before: it counts as stored, as one that a broker had kept.
 
         `val`: the new value; `data`: its dates and its quality.
         """
@@ -221,7 +225,7 @@ class Listener:
             topic.kind = self.kinds[name]
 
     def datachange_notification(self, node: Node, val: object, data: DataChangeNotif) -> None:
-        """Note a change; of a variable's first value only that it is there."""
+        """Note a change in the statistics of its topic; of a variable's first value, which may be old, no times."""
         name, body = _translate_change(node, val, data)
         stored = name not in self.topics
         note_payload(self.topics, name, body, time.time_ns())
@@ -231,7 +235,7 @@ class Listener:
 
 def _make_client(where: Address) -> Client:
     """Return a client of the server at an address, with its user and password if it has any."""
-    # It warns of everything of which a server grants less than it asks for.
+    # The client library warns of everything of which a server grants less than it asks for: not logged.
     logging.getLogger("asyncua").setLevel(logging.ERROR)
     client = Client(str(where), timeout=WAIT)
     if where.user is not None:
@@ -269,7 +273,10 @@ async def _find_variables(client: Client) -> list[Node]:
 
 
 def _translate_change(node: Node, value: object, data: DataChangeNotif) -> tuple[str, bytes]:
-    """Return the topic of a change and its message; a value of bad quality, or NaN or infinite, becomes null."""
+    """Return the topic of a variable's change, its identifier, and its message: JSON of the value and its dates.
+
+    A value of bad quality, or NaN or infinite, becomes null; what is no number a text.
+    """
     sample = data.monitored_item.Value
     good = sample.StatusCode is None or sample.StatusCode.is_good()
     if not good or (isinstance(value, float) and not isfinite(value)):  # JSON has neither NaN nor infinity

@@ -80,13 +80,16 @@ class Pipe:
             return self._read_available()
 
     def _warn_if_broken(self) -> None:
-        """Warn, once, that what came could not be unpacked to its end."""
+        """Warn, once, that what came (`_text`, which may be compressed) could not be unpacked to its end."""
         if self._text.broken and not self._said:
             self._said = True
             LOG.warning("%s", self._text.broken)
 
     def _read_available(self) -> bytes:
-        """Read what is there; of a sender that is ahead also what it sends next."""
+        """Return the bytes that are there, at most READ; of a sender that is ahead (FULL or more) also what comes next.
+
+        For that MORE milliseconds are waited each time.
+        """
         data = more = os.read(self.source, READ)
         waiting = select.poll()
         waiting.register(self.source, select.POLLIN)
@@ -136,7 +139,8 @@ class Pipe:
 def _set_nonblocking(file: int) -> Iterator[tuple[int, int | None]]:
     """Yield a descriptor to write to, and the number of bytes that it takes without waiting; None for any number.
 
-    A pipe is opened again, since whether it waits is a property that all who opened it share.
+    A pipe is opened again, since whether it waits is a property that all who share an opened one have in common. Where
+    that fails, AT_ONCE bytes never wait in one that takes any.
     """
     mode, again = os.fstat(file).st_mode, None
     if stat.S_ISFIFO(mode):

@@ -59,13 +59,17 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
 
 
 def events_of_recording(table: Recording, network: Network) -> tuple[list[Event], np.datetime64 | None]:
-    """Return the events of rows of time, in order, and the date of time 0, as `recorded` does."""
+    """Return the events of rows of time, in order, and the date of time 0, as `recorded` does.
+
+    An event is what one node measured, or the inputs, at a time. None for the date where times are numbers or steps.
+    """
     # Time of each row: its index if the network counts steps, else seconds.
     dated = table.time.dtype.kind == "M"
     origin = table.time[0] if dated else None
     steps = TIME_STEP not in network.inputs
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
+    # The time step is no input of messages: they say times, which must agree with it.
     given = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
     if not steps:
         check_time_steps(
@@ -87,6 +91,7 @@ def check_time_steps(dt: np.ndarray, time: np.ndarray, numbers: np.ndarray, sour
         source: name of the table, for errors.
     """
     since = np.diff(time)
+    # SAME: the relative difference that rounded times explain.
     wrong = np.flatnonzero(~np.isclose(dt[1:], since, rtol=SAME, atol=1e-3 * SAME))
     if wrong.size:
         row = int(wrong[0])
@@ -159,7 +164,7 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
 
 
 def _find_loss_probabilities(loss: float, run: float) -> tuple[float, float]:
-    """Return P(loss | loss) and P(loss | no loss) of the chain of losses.
+    """Return P(loss | loss) and P(loss | no loss) of a two-state Markov chain of messages, lost or not.
 
     Args:
         loss: its stationary probability pi of a loss.
@@ -183,8 +188,8 @@ def _find_loss_probabilities(loss: float, run: float) -> tuple[float, float]:
 def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     """Delay events as in a recorded trace, and return those that arrive, in order of arrival.
 
-    The trace has one row for each message, and is repeated from its start if there are more messages. Inputs arrive at
-    once.
+    The trace has one row for each message but inputs, which arrive at once, and is repeated from its start if there are
+    more messages.
 
     Args:
         events: the events as they are sent.
@@ -218,13 +223,13 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
         Pairs of the arrival time and the line of JSON.
     """
     for event in events:
-        arrival = event.time if event.arrival is None else event.arrival
+        arrival = event.time if event.arrival is None else event.arrival  # without one: at once
         said = {"arrival": _format_time(arrival, origin)}
         yield arrival, json.dumps(encode_event(event, plant, origin) | said)
 
 
 def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
-    """Return an event as the fields of a message, without its arrival."""
+    """Return an event as the fields of a message, without its arrival; NaN as null. `origin`: date of time 0."""
     values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(event.values)]
     name = {"plant": plant} if plant else {}
     moment = {"time": _format_time(event.time, origin)}
@@ -243,7 +248,7 @@ def _sort_events(events: list[Event]) -> list[Event]:
 
 
 def _format_time(time: float, origin: np.datetime64 | None) -> float | str:
-    """Return a time as messages have it: a date where time 0 has one, else the number."""
+    """Return a time as messages have it: an ISO 8601 date in UTC where time 0 has one (`origin`), else the number."""
     if origin is None:
         return float(time)
     nanoseconds = int(origin.astype("datetime64[ns]").astype(np.int64)) + round(time * 1e9)

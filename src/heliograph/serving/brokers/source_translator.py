@@ -51,6 +51,7 @@ class Translator:
         # The only topic, if there is one, and it is no pattern (with the wildcards + or #).
         is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
         self._alone = topics[0] if is_alone else None
+        # Readings so far by plant and node; stored messages left out, since they have no date.
         self._counts, self._stored = Counter[tuple[str, str]](), 0
         # Values of the newest times of each plant and node without a count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
@@ -64,12 +65,15 @@ class Translator:
             topic: the topic.
             payload: JSON.
             arrival: when it arrived.
-            stored: whether the broker had stored it for new subscribers.
+            stored: whether the broker had stored it for new subscribers: it may be old, and have come before.
         """
+        # The broker may deliver a copy of it again (`repeatable`), which then gets the same number.
         return self._read_payload(topic, payload, arrival, stored, repeatable=True, where=topic)
 
     def topic_of(self, path: Path | None) -> str | None:
-        """Return the topic of messages that name none: that of their file, or the only one; None if there is neither.
+        """Return the topic of messages that name none: one with their file's name, or the only one of the sources.
+
+        None if there is neither.
 
         Args:
             path: the file; None of a pipe.
@@ -84,6 +88,7 @@ class Translator:
             path: the file; None of a pipe.
             header: the names of the columns.
         """
+        # The only topic is that of any file, if the table has the columns that it needs.
         topic = self.topic_of(path)
         if topic is None or (path is not None and topic in (path.name, make_default_topic(path))):
             return topic
@@ -111,8 +116,8 @@ class Translator:
         return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
 
     def left_out(self) -> list[str]:
-        """Return lines on messages that were not used: of unknown topics, and stored ones."""
-        lines, unknown = [], +self.sources.unknown
+        """Return lines on messages that were not used, as of unknown topics, and on what is odd in those used."""
+        lines, unknown = [], +self.sources.unknown  # counts by topic; + leaves zeros out
         if unknown:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
@@ -162,7 +167,10 @@ class Translator:
         return results
 
     def _watch_for_several_senders(self, topic: str, reading: Reading, content: object) -> None:
-        """Note the fields of a message, by which several senders of one node can be told; warn of them now and then."""
+        """Note the fields of a message, by which several senders of one node can be told apart, and warn of them.
+
+        A warning comes at each power of two of the messages.
+        """
         senders = self.sources.senders
         senders.note_fields(topic, reading.plant, reading.node, content, self.sources.list_fields(topic))
         for line in senders.describe_at_powers_of_two_messages():
@@ -171,7 +179,10 @@ class Translator:
     def _explain_unread(
         self, topic: str, unread: Unread, known: datetime | None, repeatable: bool
     ) -> UnreadMessage | str:
-        """Return why a message could not be read, with its node, count and time where these were."""
+        """Return why a message could not be read: with its node, count and time where these were, else the text alone.
+
+        `known`: when it arrived, None where that is not known; `repeatable`: whether a copy of it may come again.
+        """
         why = str(unread.error)
         if unread.counted is None:
             return why
@@ -218,7 +229,8 @@ class Translator:
     def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
         """Return when a reading was measured: a date, or a number of steps; without a time, when it arrived.
 
-        Raises ValueError, which names the topic, at a date of more than a year before a known arrival.
+        Raises ValueError, which names the topic, at a date of more than a year before a known arrival (`is_known`).
+        A reading's time is in nanoseconds since 1970, or counts steps.
         """
         if reading.time is None:
             return arrival
@@ -232,15 +244,16 @@ class Translator:
         return time
 
     def _count_reading(self, reading: Reading, repeatable: bool) -> int:
-        """Return a reading's own count, or else a number: among those of its node and time, or of its node.
+        """Return the reading's own count; without one, its number among those of its node and time, from 0.
 
+        Without a time either, its number among all of its node.
         `repeatable`: whether a copy of it may come again, which gets the same number.
         """
         if reading.sequence is not None:
             return reading.sequence
         name = reading.plant, reading.node
         number = self._counts[name]  # of all readings of this node before
-        self._counts[name] += 1
+        self._counts[name] += 1  # each counts, whether this number is used or not
         if reading.time is not None:
             number = self._number_among_simultaneous(reading, repeatable)
         return number
@@ -253,16 +266,16 @@ class Translator:
         assert reading.time is not None
         values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
         mine = reading.values.tobytes()
-        if repeatable and mine in values:
+        if repeatable and mine in values:  # a copy
             return values.index(mine)
         values.append(mine)
-        if len(self._uncounted) > REMEMBERED:
+        if len(self._uncounted) > REMEMBERED:  # forget the oldest time
             self._uncounted.popitem(last=False)
         return len(values) - 1
 
 
 def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
-    """Return a date, to the microsecond, from nanoseconds since 1970.
+    """Return a date in UTC, cut to the microsecond, from nanoseconds since 1970.
 
     Raises:
         ValueError: beyond the years that dates have.
@@ -274,7 +287,10 @@ def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:
 
 
 def _decode_json(payload: object, where: str) -> object:
-    """Return the content of a payload of JSON; what is read already, as a row's columns, as it is."""
+    """Return the content of a payload of JSON, at most LONGEST bytes; what is read already, as a row, as it is.
+
+    `where`: place that an error names.
+    """
     if not isinstance(payload, bytes | str):
         return payload
     if len(payload) > LONGEST:

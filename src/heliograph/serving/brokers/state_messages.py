@@ -102,7 +102,10 @@ class _DiscoveredSensor(NamedTuple):
 
 
 def _list_sensors(place: _PublishedState, unit: str | None, has_sender: bool) -> list[_DiscoveredSensor]:
-    """Return the sensors of a state: its value and deviation, and a dead sender, if its node has one that may be."""
+    """Return the sensors of a state as Home Assistant has them: value, deviation, and whether its sender is dead.
+
+    The last where the node has a sender that may be found dead (`has_sender`).
+    """
     number = {"state_class": "measurement"} | ({"unit_of_measurement": unit} if unit else {})
     sensors = [
         _DiscoveredSensor("sensor", "value", place.label, number),
@@ -124,7 +127,10 @@ def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
 def _iterate_states(
     topic: str, states: Sequence[str], estimate: Mapping[str, Any]
 ) -> Iterator[tuple[_PublishedState, int, Mapping[str, Any]]]:
-    """Yield each state of each filter, with its number and the filter's estimate."""
+    """Yield each state of each filter and node in a published `estimate`: with its topic, its number, and the filter's.
+
+    The last is the filter's part of the estimate, such as its mean. Topics have names as single words.
+    """
     plant = str(estimate["plant"])
     for node, filters in estimate["estimates"].items():
         for name, message in filters.items():

@@ -82,21 +82,23 @@ class _StateWriter(Connection):
 
     def __init__(self, topics: StateTopics, states: Sequence[str]):
         super().__init__(topics.address, "")
+        # Topics of which Home Assistant was told; the newest estimate by plant, to be published again; its lock.
         self._topics, self._states, self._announced = topics, states, set[str]()
         self._newest, self._one_at_a_time = dict[str | None, bytes](), threading.Lock()
         self._available = availability_topic(topics.address.topic)
+        # The last will: what the broker says for this client when its connection breaks.
         self.client.will_set(self._available, OFFLINE, AT_LEAST_ONCE, retain=True)
         self.start()
 
     def publish(self, plant: str | None, body: bytes) -> None:
-        """Publish the states of an estimate of a plant."""
+        """Publish the states of an estimate of a plant, now and again with each new connection."""
         with self._one_at_a_time:
             self._newest[plant] = body
             if self.client.is_connected():
                 self._publish(body)
 
     def _publish(self, body: bytes) -> None:
-        """Publish states, and before the first of a filter what Home Assistant has to know."""
+        """Publish states, and before the first of a filter, with `discovery`, what Home Assistant has to know."""
         topic = self._topics.address.topic
         if self._topics.discovery:
             for message in make_discovery_messages(topic, self._states, body, self._topics.discovery):
@@ -116,7 +118,7 @@ class _StateWriter(Connection):
                 self._publish(body)
 
     def close(self) -> None:
-        """Say offline, which a connection that ends in order does not."""
+        """Say offline, and end: the last will, which would say it, is only for connections that break."""
         if self.client.is_connected():
             self.client.publish(self._available, OFFLINE, AT_LEAST_ONCE, retain=True).wait_for_publish(2.0)
         super().close()

@@ -37,6 +37,7 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
+        # The class says what these are. The reader of rows is chosen by the header, when it has come.
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
@@ -47,7 +48,7 @@ class TableLineReader:
         text = line.strip()
         if not text or text[0] in "[{" or not (names := guess_names_in_header(text)):
             return False
-        if text.startswith(ANNOTATIONS):
+        if text.startswith(ANNOTATIONS):  # lines above the names that only tables have
             return True
         rows = RowReader(self._network, self._source, strict=False, ignore_unknown=False)
         known = {*OWN, TOPIC, PAYLOAD, *rows.names}
@@ -70,13 +71,16 @@ class TableLineReader:
         return rest + (self._reader.end() if isinstance(self._reader, TimeRowReader) else [])
 
     def _read_rows(self, rows: list[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows of text; the header chooses their reader."""
+        """Return the messages of rows of text; the header, once it is read, chooses their reader. None before it."""
         if self._reader is None and self._text.header:
             self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
     def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
-        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time."""
+        """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time.
+
+        A row of time has the measurements of all nodes; an event is one node's, with its name and count.
+        """
         if {NODE, SEQUENCE} <= set(header):
             own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
             return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
@@ -97,7 +101,7 @@ class MessageRowReader:
         self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows, and why others cannot be read."""
+        """Return the messages of rows (`_decode`), and texts why others cannot be read, in order."""
         return [
             payload for row in rows for payload in ([str(row)] if isinstance(row, InputError) else self._decode(row))
         ]
@@ -144,8 +148,8 @@ class TimeRowReader:
     def _check_time_steps(self, cells: RecordingRows, time: np.ndarray) -> None:
         """Raise ValueError where a row's time step is not the time since the row before; `time`: times of the rows.
 
-        With the time of the row before them, the first step can be checked too. The check takes no step and no number
-        of that row, in whose place those of the first row stand.
+        With the time of the row before them, if any, the first step can be checked too. The check uses neither step nor
+        number of that row before: those of the first row stand in their place.
         """
         before = [] if self._before is None else [self._before]
         steps = cells.inputs[TIME_STEP]
@@ -157,7 +161,10 @@ class TimeRowReader:
         )
 
     def end(self) -> list[Payload]:
-        """Return the messages of the rows of a file."""
+        """Return the messages of the rows of a file, now that all have come, and why others have none.
+
+        Messages are lines of JSON. Doubts about the rows (warnings) are logged.
+        """
         if not self._cells:
             return []
         with warnings.catch_warnings(record=True) as doubts:
@@ -170,7 +177,10 @@ class TimeRowReader:
         return [*lines, *(str(error) for error in self._rows.refused)]
 
     def _time_of_messages(self, time: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Return the times in the unit of messages: steps, numbers, or seconds since the first date."""
+        """Return the times in the unit of messages: steps, numbers, or seconds since the first date.
+
+        `numbers`: those of the rows, from 1; a row is a step where time counts steps.
+        """
         if self._steps:
             return np.asarray(numbers - 1.0)
         if time.dtype.kind != "M":
@@ -180,7 +190,10 @@ class TimeRowReader:
 
 
 def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
-    """Return the messages of an event in our own form, or why it cannot be read, with its count and time if known."""
+    """Return the messages of an event in our own form: its measurement, and its inputs if it has any.
+
+    Or why one cannot be read: as a text, or with its count and time where these are known.
+    """
     try:
         found = reader.read(where, content)
     except InputError as error:

@@ -72,7 +72,7 @@ FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
 def raise_if_cancelled() -> None:
-    """Raise the cancellation again if this task was cancelled: a client may have swallowed it."""
+    """Raise the cancellation again if this task was cancelled: a client library may have caught it and gone on."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
@@ -124,11 +124,15 @@ def encode_name(plant: str) -> str:
         plant: name of a plant.
     """
     text("plant", plant)
+    # `quote` leaves ._~ as they are, of which topics and subjects may make something else.
     return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
 
 
 def topic_of(topic: str, output: Output) -> str:
-    """Return the topic of an output of the service at `topic`; of a message to a node, that node's input topic."""
+    """Return the topic of an output of the service at `topic`; of a message to a node, that node's input topic.
+
+    The services of neighbouring nodes are at topics that differ in the last word alone, the node's name.
+    """
     if output.kind == "message":
         return "/".join([*topic.split("/")[:-1], encode_name(output.to), "in", encode_name(output.plant)])
     return f"{topic}/out/{output.kind}/{encode_name(output.plant)}"
@@ -145,7 +149,7 @@ def part_of(plant: str, parts: int) -> int:
         The number of the part, 0 <= number < `parts`.
     """
     check_count("parts", parts)
-    value = OFFSET
+    value = OFFSET  # FNV-1a, a hash of 32 bits that is the same in every process and program
     for byte in encode_name(plant).encode():
         value = (value ^ byte) * PRIME & 0xFFFFFFFF
     return value % parts

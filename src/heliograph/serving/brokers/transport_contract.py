@@ -56,7 +56,7 @@ class _Examination:
     def __init__(self, broker: Broker, messages: int, patience: float):
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
-        self._numbers = count()
+        self._numbers = count()  # of the messages, each of which has another
 
     async def check_all(self) -> bool:
         """Check each promise in turn, with one service after another; return whether redelivery keeps the order."""
@@ -179,7 +179,10 @@ class _Examination:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
     def _make_bodies(self, total: int) -> list[bytes]:
-        """Make bodies that were not sent before; the first is long."""
+        """Return bodies of messages, each with a number that none had before; the first is LONG bytes long.
+
+        With a letter of two bytes, so that a transport that changes the encoding is found out.
+        """
         return [
             b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)
         ]

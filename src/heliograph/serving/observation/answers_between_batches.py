@@ -24,7 +24,10 @@ class LastAnswers(Generic[T]):
         self._last: OrderedDict[str, T] = OrderedDict()
 
     def ask(self, question: str = "") -> T:
-        """Return the answer now; if a batch holds the lock for longer than PATIENCE, the last one given, or `begin`."""
+        """Return the answer now; if a batch holds the lock for longer than PATIENCE, the last one given, or `begin`.
+
+        Of so many questions (`most`), those asked last, the answers are kept.
+        """
         if self.lock.acquire(timeout=PATIENCE):
             try:
                 self._last[question] = self.answer(question)

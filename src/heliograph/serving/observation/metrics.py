@@ -36,10 +36,11 @@ class ServiceMetrics(Collector):
         self.watch = watch
         watch.registry.register(self)
         text = partial(generate_latest, watch.registry)
+        # The last text, for when a batch takes long.
         self._texts = LastAnswers(watch.lock, lambda _: text(), text())
 
     def collect(self) -> Iterable[Metric]:
-        """Yield the current metrics."""
+        """Yield the current metrics of all services that `watch` observes, as Prometheus asks for them."""
         yield from _collect_links(self.watch)
         yield from _collect_nis(self.watch)
         yield from _collect_outputs(self.watch)
@@ -79,7 +80,7 @@ def _collect_plants(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_crossings(watch: ServiceWatch) -> Metric:
-    """Return the metric of thresholds that may be crossed, of the plants in which that is most probable."""
+    """Return the metric of thresholds that may be crossed, of the SHOWN plants in which that is most probable."""
     what = "Probability that a level of --threshold is passed by so far ahead."
     labels = ["plant", "node", "filter", "threshold", "ahead"]
     crossings = GaugeMetricFamily("heliograph_plant_passing", what, labels=labels)
@@ -118,7 +119,7 @@ def _collect_links(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_dead_senders(watch: ServiceWatch) -> Metric:
-    """Return the metric of the dead senders, by node."""
+    """Return the metric of the dead senders by node: in how many plants the node's sender is silent for too long."""
     what = "Plants in memory whose sender at a node misses its heartbeats, and not by chance, or is past its timeout."
     dead = GaugeMetricFamily("heliograph_dead_senders", what, labels=["node"])
     for node, count in watch.dead_senders().items():
@@ -127,7 +128,7 @@ def _collect_dead_senders(watch: ServiceWatch) -> Metric:
 
 
 def _collect_remarks(watch: ServiceWatch) -> Metric:
-    """Return the metric of what filters say happened to their states."""
+    """Return the metric of gates that gave in, by node and filter: refused values are believed after all."""
     what = "Times that a gate gave in: it took up what it had refused for long."
     gave_in = CounterMetricFamily("heliograph_gave_in", what, labels=["node", "filter"])
     for key, count in watch.remarks().items():
@@ -136,7 +137,7 @@ def _collect_remarks(watch: ServiceWatch) -> Metric:
 
 
 def _collect_fusion_doubts(watch: ServiceWatch) -> Metric:
-    """Return the metric of filters under fusions whose claims are doubted."""
+    """Return the metric of fusions in doubt: those without a test of their own, by the tests of what they fuse."""
     what = "1 if a filter whose estimates a fusion without a test of itself takes is doubted."
     doubted = GaugeMetricFamily("heliograph_fusion_doubted", what, labels=["filter"])
     for row in watch.judge_fusions(watch.nis):
@@ -145,7 +146,10 @@ def _collect_fusion_doubts(watch: ServiceWatch) -> Metric:
 
 
 def _collect_nis(watch: ServiceWatch) -> Iterable[Metric]:
-    """Return the metrics of each filter's NIS over its expectation, with the band in which it should be."""
+    """Return the metrics of each filter's NIS (normalised innovation squared) over its expectation, and of its band.
+
+    The ratio should be 1; an honest filter's is between the ends of the band.
+    """
     labels = ["node", "filter"]
     ratio = GaugeMetricFamily(
         "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels
@@ -159,7 +163,10 @@ def _collect_nis(watch: ServiceWatch) -> Iterable[Metric]:
 
 
 def _collect_outputs(watch: ServiceWatch) -> Iterable[Metric]:
-    """Return the metrics of each output of filters that weigh, in OUTPUTS; none where there are too few rows."""
+    """Return the metrics in OUTPUTS (as mean weight, bias) of each received number of filters that weigh these.
+
+    Without a number where there are too few rows.
+    """
     metrics = {
         name: GaugeMetricFamily(f"heliograph_output_{name}", words, labels=["node", "filter", "output"])
         for name, words in OUTPUTS.items()

@@ -113,8 +113,8 @@ def make_application(
     overview = LastAnswers(watch.lock, lambda _: make_overview_page(watch), make_overview_page(watch))
 
     def page(request: Request) -> Response:
-        """Answer with the page, the first view in place of its only "null"; all others come from /events."""
-        # Without a "<" no name ends the element that the view stands in.
+        """Answer with the page, the first view in place of its first "null"; all others come from /events."""
+        # Without a "<" no name in the view can end the HTML element that it stands in.
         first = json.dumps(watch.make_page_data(request.query_params.get("plant"))).replace("<", "\\u003c")
         return Response(_read_page_file("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
 
@@ -131,7 +131,7 @@ def make_application(
         return Response(overview.ask(), media_type="text/html", headers=POLICY)
 
     def health(_: Request) -> Response:
-        """Answer whether the service serves, or a batch is stuck: no more than that, so that it needs no token."""
+        """Answer 503 if a batch has been taken for more than STUCK seconds, else ok: no more, so it needs no token."""
         busy = watch.busy()
         if busy > STUCK:
             return PlainTextResponse(f"a batch has been taken for {busy:.0f} s", 503)
@@ -146,8 +146,8 @@ def make_application(
 def _make_middleware(token: str | None, hosts: Sequence[str]) -> list[Middleware]:
     """Return what each request passes: the check of the token, and before it, where it is needed, that of the host.
 
-    Without a token a page of elsewhere that names itself 127.0.0.1 does not get in; nor where `hosts` are given one
-    that asks for another.
+    The host is what a request says that it asks for: it must be a name of this machine, or one of `hosts`. So a page of
+    elsewhere whose name was made to lead here does not get in. With a token alone, no `hosts`, the token sees to that.
     """
     middleware = [Middleware(TokenMiddleware, token)]
     if token is None or hosts:

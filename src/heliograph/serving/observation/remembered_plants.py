@@ -44,8 +44,11 @@ class RememberedPlants:
     """
 
     def __init__(self, names: Mapping[tuple[str, str], Sequence[str]]):
-        """Begin with no plant; `names`: those of the received numbers by node and filter."""
-        self.count, self._names = 0, names  # names of the received numbers by node and filter
+        """Begin with no plant; `names`: those of the received numbers by node and filter.
+
+        Each table is by plant, that with the newest message last.
+        """
+        self.count, self._names = 0, names  # the former: of points so far
         self.points: OrderedDict[str, deque[ChartPoint]] = OrderedDict()
         self.outputs: OrderedDict[str, RecentInnovations] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
@@ -67,7 +70,10 @@ class RememberedPlants:
         return _move_to_newest(self.outputs, plant, lambda: RecentInnovations(MEMORY, self._names))
 
     def keep_point(self, plant: str, message: Mapping[str, Any]) -> None:
-        """Keep a plant's newest estimates as a point of its chart, and what its senders' silence means."""
+        """Keep a plant's newest estimates, a message as sent, as a point of its chart, and what silence means.
+
+        Of each sender in the message: whether it is dead, that is silent for too long.
+        """
         self.count += 1
         estimates = {
             node: {name: _means_and_deviations(estimate) for name, estimate in filters.items()}
@@ -83,7 +89,10 @@ class RememberedPlants:
                 self.dead_senders[plant] = dead
 
     def keep_crossings(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
-        """Keep the probabilities that a plant's thresholds are crossed; `horizons`: its newest forecast, as sent."""
+        """Keep the probabilities that a plant's thresholds are crossed; `horizons`: its newest forecast, as sent.
+
+        They take the place of those before, which are dropped where the forecast has none.
+        """
         crossings = dict[tuple[str, ...], Mapping[str, float]]()  # by node, filter, threshold, how far ahead
         for horizon in horizons:
             for node, filters in horizon["estimates"].items():
@@ -99,6 +108,7 @@ class RememberedPlants:
 
         Of `most` plants at most, those in which a crossing is most probable.
         """
+        # p["by"]: probability up to then, at any time.
         largest = {plant: max(p["by"] for p in levels.values()) for plant, levels in self.crossings.items()}
         first = sorted(largest, key=lambda plant: -largest[plant])[:most]
         return [((plant, *key), p["by"]) for plant in first for key, p in self.crossings[plant].items()]
@@ -116,14 +126,14 @@ class BatchHistograms:
         self._committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=registry)
 
     def observe(self, batch: BatchTimes) -> None:
-        """Add the times of one batch."""
+        """Add the times of one batch to the histograms: seconds in all, of the commit, and its oldest message's age."""
         self._took.observe(batch.took)
         self._committed.observe(batch.committed)
         self._lag.observe(batch.lag)
 
 
 def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], T], most: int = PLANTS) -> T:
-    """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond so many."""
+    """Return the entry of a plant, made if needed, as the newest; drop the oldest entry beyond `most`."""
     if plant not in newest:
         newest[plant] = make()
         if len(newest) > most:
@@ -133,7 +143,10 @@ def _move_to_newest(newest: OrderedDict[str, T], plant: str, make: Callable[[], 
 
 
 def _means_and_deviations(message: Mapping[str, Any]) -> dict[str, object]:
-    """Return means, standard deviations where the filter claims a covariance, and the modes' probabilities if any."""
+    """Return a filter's means, standard deviations, claim, and modes' probabilities if any, from its estimate as sent.
+
+    The deviations are null where the filter claims no covariance.
+    """
     rows = message["covariance"]
     claimed = rows and [_deviation_of(row[i]) for i, row in enumerate(rows)]
     modes = {"modes": message["modes"]} if message.get("modes") is not None else {}

@@ -31,7 +31,10 @@ class RunningNis:
     numbers: int = 0
 
     def add(self, squared: float, received: int) -> None:
-        """Add the NIS of one row, with its degrees of freedom."""
+        """Add the NIS (normalised innovation squared) of one row, of so many received numbers, its degrees of freedom.
+
+        Older rows count less with each: total, and its mean and variance if the NIS are chi-squared (m, 2 m each).
+        """
         weight = 1 - 1 / MEMORY
         self.total = weight * self.total + squared
         self.mean = weight * self.mean + received
@@ -44,7 +47,10 @@ class RunningNis:
         return self.total / self.mean if self.mean else float("nan")
 
     def band(self) -> tuple[float, float]:
-        """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right."""
+        """Return the interval that contains the ratio with probability 1 - DOUBT if the covariance is right.
+
+        The ratio is the weighted sum of NIS over its mean, taken as of a gamma law with the sum's mean and variance.
+        """
         if not self.mean:
             return 0.0, float("inf")
         shape = self.mean**2 / self.variance
@@ -52,7 +58,7 @@ class RunningNis:
         return float(low), float(high)
 
     def explain_doubt(self) -> str | None:
-        """Return why the claim is doubtful, in words; None if it is not, or too few rows were tested."""
+        """Return why the claimed covariance is doubtful, in words; None if it is not, or too few numbers have come."""
         low, high = self.band()
         if self.numbers < FEWEST:
             return None
@@ -68,8 +74,8 @@ class RunningNis:
 def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
     """Return the normalised innovation squared (NIS) of what a filter used, and of how many numbers it is.
 
-    Of a filter that weighs these are the numbers of weight 1/2 or more, each over its variance: outliers that it left
-    out do not count against it.
+    Of a filter that weighs what it receives (its `outputs`: innovation, variance, weight) these are the numbers of
+    weight 1/2 or more, each squared over its variance: outliers that it left out do not count against it.
     """
     outputs = message.get("outputs")
     if message.get("nis") is None or not outputs:

@@ -142,9 +142,10 @@ class ServiceWatch:
                     self._test_claims(output.plant, message["estimates"])
 
     def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the NIS of a plant's newest estimates to the running tests, and weighed outputs to the recent ones.
+        """Add the NIS (normalised innovation squared) of a plant's newest estimates to the running tests of claims.
 
-        Each to those of the plant, and to those of all plants. `estimates`: messages by node and filter.
+        And the outputs of filters that weigh to the recent ones: each to those of the plant, and to those of all
+        plants. `estimates`: messages by node and filter.
         """
         tests_of_plant, outputs_of_plant = self._memory.tests_of(plant), self._memory.outputs_of(plant)
         for node, filters in estimates.items():
@@ -162,7 +163,7 @@ class ServiceWatch:
 
         Of `most` plants at most, those in which a crossing is most probable.
         """
-        with self._noting:
+        with self._noting:  # so that nothing is recorded meanwhile
             return self._memory.list_crossings(most)
 
     def plants(self) -> Iterator[tuple[str, WatchedPlant]]:
@@ -187,7 +188,10 @@ class ServiceWatch:
         return {node: tally | ({"lost": None} if node in self.uncounted else {}) for node, tally in links.items()}
 
     def list_worst_plants(self) -> list[PlantTroubles]:
-        """Return the plants with something wrong, the worst first."""
+        """Return the plants with something wrong, the worst first: doubted filters, dead senders, refused messages.
+
+        Refusals are counted anew of those plants alone that had a message since the last look (`touched`).
+        """
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):
             counts = [
@@ -206,14 +210,14 @@ class ServiceWatch:
         return 0.0 if begun is None else monotonic() - begun
 
     def dead_senders(self) -> Mapping[str, int]:
-        """Count the plants that have a dead sender, by node with a trigger, over all services."""
+        """Return the number of plants that have a dead sender, one silent for too long, by node, over all services."""
         total = Counter[str]()
         for service in self.services:
             total.update(service.dead_senders())  # adds, and holds zeros
         return total
 
     def remarks(self) -> Mapping[tuple[str, str], int]:
-        """Count how often filters changed a state as users should know, by node and filter, over all services."""
+        """Return how often filters changed a state as users should know, by node and filter, over all services."""
         total = Counter[tuple[str, str]]()
         for service in self.services:
             total.update(service.remarks())
@@ -264,7 +268,10 @@ class ServiceWatch:
         }
 
     def _ask_services(self, plant: str) -> ServiceAnswers:
-        """Ask the services, between two batches, for their plants, and for the counts of one, summed over them."""
+        """Return the names of the services' plants, the counts of messages of one plant, and of what is wrong in all.
+
+        Asked between two batches. The counts are by node, over all services that have the plant.
+        """
         every = list(self.plants())
         return ServiceAnswers(
             names=sorted(name for name, _ in every),
@@ -276,6 +283,7 @@ class ServiceWatch:
     def judge_fusions(self, tests: Mapping[tuple[str, str], RunningNis]) -> list[dict[str, object]]:
         """Return a row for each fusion without a NIS test of its own: in doubt if that of any estimate it fuses is.
 
+        NIS: normalised innovation squared; a fusion takes the estimates of several filters (`parts`) and no data.
         `by` names the estimates that are in doubt, else all that were tested.
         """
         rows: list[dict[str, object]] = []
@@ -311,7 +319,7 @@ class ServiceWatch:
 
 
 def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
-    """Sum the counts of several plants, by node."""
+    """Return the sums over several plants of their counts of messages, by node and kind of count."""
     results: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():
@@ -322,7 +330,7 @@ def _add_counts(plants: Sequence[WatchedPlant]) -> dict[str, dict[str, int]]:
 
 
 def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, object]:
-    """Return one row of the page's table of tests."""
+    """Return one row of the page's table of tests: the ratio of a filter's NIS to its expectation, with its band."""
     low, high = test.band()
     names = {
         "node": node,
@@ -335,7 +343,10 @@ def _make_test_row(node: str, filter_name: str, test: RunningNis) -> dict[str, o
 
 
 def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> ServiceWatch:
-    """Return the observer of services of a network, whose name is `title`; `uncounted` as of a `ServiceWatch`."""
+    """Return the observer of services of a network, whose name is `title`.
+
+    `uncounted`: nodes whose messages carry no count, so that it is not known how many are lost.
+    """
     claims = network.claims()
     fused = {
         name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])

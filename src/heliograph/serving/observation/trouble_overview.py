@@ -42,7 +42,7 @@ class PlantTroubles(NamedTuple):
 
     @property
     def describe(self) -> list[str]:
-        """Return it in words, a line each."""
+        """Return what is wrong with the plant, a line each: dead senders, doubted filters, refused messages."""
         lines = [f"{node}: its sender is dead" for node in self.dead]
         lines += [f"{d.node}/{d.filter}: squared innovations {d.ratio:.2g} times what its covariance says "
                   f"({d.low:.2g} to {d.high:.2g})" for d in self.doubts]  # fmt: skip
@@ -85,7 +85,10 @@ class TroubleOverview:
 
 
 def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
-    """Yield the doubted filters of a plant, the most doubted first."""
+    """Return the doubted filters of a plant, the most doubted first; `tests`: of their claims, by node and filter.
+
+    A filter is doubted if the ratio of its squared innovations to what its covariance says is outside of its band.
+    """
     doubts = []
     for (node, name), test in tests.items():
         # The ratio, of deviation sqrt(variance) / mean, is within NEAR deviations of 1: clearly inside of its band.
@@ -121,7 +124,7 @@ that were refused.{more}</p></header>
 
 
 def make_plants_page(title: str, plants: Collection[str], wrong: Sequence[PlantTroubles], most: int) -> str:
-    """Return the page of all plants, those with something wrong first, of `most` rows at most."""
+    """Return the page of all plants in HTML, those with something wrong first, of `most` rows at most."""
     named = {item.plant for item in wrong}
     rows = [(item.plant, "<br>".join(escape(line) for line in item.describe), "doubt") for item in wrong]
     rows += [(plant, "nothing", "fine") for plant in sorted(plants) if plant not in named]

@@ -22,13 +22,14 @@ def open_database(location: str) -> Engine:
     """
     engine = create_engine(read_location(location))
     if engine.dialect.name == "sqlite":
+        # Each commit on the disk, and transactions that lock the database from their beginning on.
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_immediate)
     return engine
 
 
 def read_location(location: str) -> URL:
-    """Read the location of a store.
+    """Return the URL of a store's database: SQLite for a path, or PostgreSQL.
 
     Raises:
         ValueError: no path, or the URL of another kind of database.
@@ -48,7 +49,8 @@ def read_location(location: str) -> URL:
 def is_server_away(error: SQLAlchemyError) -> bool:
     """Return whether an error means that a server does not answer, or ends its connections: it may answer later.
 
-    One that answers and refuses, as for a wrong password, would refuse again.
+    One that answers and refuses, as for a wrong password, would refuse again; but not for a reason that passes
+    (PASSING), as starting up. SQLite has no server.
     """
     if not isinstance(error, DBAPIError) or isinstance(error.orig, sqlite3.Error):
         return False
@@ -62,6 +64,7 @@ def _configure_sqlite(connection: Any, _: object) -> None:
     """Configure SQLite: each commit is on the disk before it returns, and readers do not wait for writers."""
     connection.isolation_level = None  # transactions begin where the engine says so
     connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can still be printed
+    # WAL: readers do not wait; FULL: on the disk; busy_timeout: milliseconds to wait for another writer.
     for pragma in (*PAGES, "journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
         connection.execute(f"PRAGMA {pragma}")
 

@@ -36,6 +36,7 @@ class Leases:
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
+        # `process`: name of this one; `parts`: number of parts of the plants; `term`: seconds of a lease.
         self.engine, self.process, self.parts, self.term = engine, process, parts, term
         insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
         self._insert = insert
@@ -44,7 +45,7 @@ class Leases:
     def renew(self) -> set[int]:
         """Report that this process is alive, lease its parts anew, and return the numbers of those that it has now.
 
-        These are the parts that it had, then free ones, up to its fair share.
+        A part is a share of the plants. These are the parts that it had, then free ones, up to its fair share.
 
         Raises:
             AwayError: the database does not answer now.
@@ -61,7 +62,7 @@ class Leases:
 
     @contextmanager
     def _raise_if_away(self) -> Iterator[None]:
-        """Turn the database's error into one line that says it is away, where it is."""
+        """Raise AwayError, of one line, in place of an error by which the database does not answer; others as is."""
         try:
             yield
         except SQLAlchemyError as error:
@@ -76,7 +77,7 @@ class Leases:
             connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
 
     def leave(self) -> None:
-        """Release everything to other processes."""
+        """Release all parts of this process to others, and its name, so that it counts for no share."""
         with self._raise_if_away(), self.engine.begin() as connection:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
@@ -84,7 +85,7 @@ class Leases:
     def _report_and_count_fair_share(self, connection: Connection, now: float) -> int:
         """Report that this process is alive, forget the dead, and return how many parts this one should have.
 
-        The remainder goes to the first processes by name.
+        The dead have not reported for longer than the term. The remainder goes to the first processes by name.
         """
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
@@ -94,9 +95,10 @@ class Leases:
         return each + (alive.index(self.process) < remainder)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
-        """Lease a part if it is ours or free; return whether it is ours now."""
+        """Lease the part of this number until `now` + term if it is ours or free; return whether it is ours now."""
         mine = {"process": self.process, "until": now + self.term}
         new = self._insert(PARTS).values(number=number, **mine)
+        # A row that is there is changed only where its lease is over or ours; else nothing is returned.
         free = (PARTS.c.until < now) | (PARTS.c.process == self.process)
         done = new.on_conflict_do_update(index_elements=["number"], set_=mine, where=free).returning(PARTS.c.number)
         return connection.execute(done).first() is not None

@@ -125,7 +125,7 @@ class Store:
 
     @contextmanager
     def _name_store_in_errors(self, expected: str) -> Iterator[None]:
-        """Turn errors of the database into one line that names the store."""
+        """Turn errors of the database into one line that names the store and says what was `expected` of it."""
         try:
             yield
         except UnicodeError:  # of a damaged one: the database's own complaint cites it
@@ -174,7 +174,7 @@ class Store:
                    f"layout {layout}, of heliograph {release}{why}")  # fmt: skip
 
     def _find_damaged(self) -> dict[str, DamagedRow]:
-        """Return the plants with damaged rows, by name."""
+        """Return the plants' rows that are not as their checksums say, by name; raise if all of the file is damaged."""
         results: dict[str, DamagedRow] = {}
         with self._engine.connect() as connection:
             if self._engine.dialect.name == "sqlite":
@@ -221,7 +221,7 @@ class Store:
         return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
 
     def begin_anew(self, names: Iterable[str]) -> None:
-        """Forget the plants of these names: each begins anew with its next message."""
+        """Remove the plants of these names, damaged or not: each begins anew with its next message."""
         with self._name_store_in_errors("a database that takes a commit"), self._engine.begin() as connection:
             for name in names:
                 damage = self.damaged.pop(name, None)
@@ -234,7 +234,7 @@ class Store:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Commit plants and outputs in one transaction, as `StoreProtocol` says.
+        """Commit plants and outputs in one transaction; return the outputs with numbers (see `StoreProtocol`).
 
         Raises:
             ConflictError: another process has committed one of the plants.
@@ -275,7 +275,7 @@ class Store:
         return outputs
 
     def unpublished(self) -> list[Output]:
-        """Return outputs that this process committed and may not have published."""
+        """Return outputs with numbers above the last published one: committed here, and perhaps not published."""
         published = self.number(PUBLISHED.format(self.process))
         return [
             entry
@@ -284,7 +284,7 @@ class Store:
         ]
 
     def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
-        """Return the journal from the batch with number `after` + 1 on, of one process or of all.
+        """Return the outputs in the journal from the batch that ends after number `after` on, of one process or all.
 
         Raises:
             ValueError: a damaged entry.
@@ -301,20 +301,20 @@ class Store:
         return outputs
 
     def number(self, name: str) -> int:
-        """Return the stored count of this name; 0 where none was stored."""
+        """Return the stored count of this name, as of published outputs; 0 where none was stored."""
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
         return 0 if row is None else self._check_count(*row)
 
     def words(self) -> dict[str, int]:
-        """Return the last words of devices that are kept, as numbers by topic."""
+        """Return the last words of devices (online or not) that are kept, as numbers by topic."""
         mine = select(NUMBERS).where(NUMBERS.c.name.startswith(WORD, autoescape=True))
         with self._name_store_in_errors("a database that can be read"), self._engine.connect() as connection:
             rows = connection.execute(mine).all()
         return {name.removeprefix(WORD): self._check_count(name, value, written) for name, value, written in rows}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
-        """Keep the last words of devices, by topic; a topic that is longer than a name may be is left out."""
+        """Keep the last words of devices (online or not), by topic; a topic longer than TOPIC is left out."""
         rows = [add_checksum(NUMBERS, WORD + topic, word) for topic, word in words.items() if len(topic) <= TOPIC]
         if rows:
             with self._name_store_in_errors("a database that can be written"), self._engine.begin() as connection:
@@ -349,7 +349,7 @@ class Store:
         self.identity = mine
 
     def begin_from(self, location: str, mine: Identity, carrier: PlantMigration | None = None) -> None:
-        """Copy the plants of another store, which is not changed; those of another network by a carrier."""
+        """Copy the plants of another store, which stays, into this empty one; `carrier` fits them to this network."""
         other = Store(location, mine if carrier is None else None)
         saying = self._name_store_in_errors(f"a database that takes the plants of {other.name}")
         with saying, self._engine.begin() as here, other._engine.connect() as there:
@@ -377,7 +377,7 @@ class Store:
         self._engine.dispose()
 
     def _add_to_count(self, connection: Connection, name: str, more: int) -> int:
-        """Add to a stored count, which locks it until the commit; return the new value."""
+        """Add `more` to a stored count, which locks it until the commit; return the new value, its checksum renewed."""
         new = self._insert(NUMBERS).values(add_checksum(NUMBERS, name, more))
         locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
@@ -389,7 +389,7 @@ class Store:
         return int(value)
 
     def _upsert(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
-        """Insert rows, or replace those of the same name."""
+        """Insert rows in a table whose key is the name, or replace those of the same name."""
         new = self._insert(table)
         others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)

@@ -88,7 +88,10 @@ def _lock_file(path: str, process: str) -> Iterator[None]:
 
 @contextmanager
 def _lock_session(engine: Engine, process: str) -> Iterator[None]:
-    """Hold an advisory lock of PostgreSQL for the life of a session, whose application's name is the process's."""
+    """Hold an advisory lock of PostgreSQL, one for each `process` name, for the life of a session; raise if taken.
+
+    The session is named after this process, so that others are told who has the lock.
+    """
     key = crc32(process.encode()) >> 1  # 31 bits: the server takes signed numbers of 32
     with engine.connect() as connection:
         connection.execute(text("SELECT set_config('application_name', :name, false)"),

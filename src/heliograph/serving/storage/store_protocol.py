@@ -66,6 +66,7 @@ class StoreProtocol(Protocol):
     ) -> list[Output]:
         """Commit plants, which must have the versions that they were read with, and outputs.
 
+        Returns the outputs of the `entries` with their numbers. `malformed`: how many messages could not be read.
         `published` is the number of the last output that was published, None if that has not changed.
 
         Raises:
@@ -122,7 +123,7 @@ class InMemoryStore:
     def commit(
         self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Number the outputs, counting from 1."""
+        """Return the outputs of the entries, numbered on from 1; nothing is kept."""
         begin = self._number + 1
         self._number += len(entries)
         return Entry.numbered(entries, begin)
@@ -151,7 +152,10 @@ class InMemoryStore:
 
 
 def describe_damaged_plants(plants: Mapping[str, DamagedRow]) -> str:
-    """Return a sentence for users on damaged plants: their names, and whether a name itself was lost."""
+    """Return a sentence for users on damaged plants: the options that begin LISTED of them anew, and if a name is lost.
+
+    `named`: whether a plant's name is as it was written.
+    """
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
     lost_name = ""

@@ -27,7 +27,7 @@ def checksum(name: str | int, *values: str | int | bytes) -> int:
 
 
 def is_row_undamaged(written: object, name: object, *values: object) -> bool:
-    """Return whether a row is as it was written; a damaged row may contain anything."""
+    """Return whether a row has the checksum `written` with it; a damaged row may contain anything."""
     if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
         return False
     return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
@@ -54,7 +54,7 @@ def add_checksum(table: Table, *values: Any) -> dict[str, object]:
 
 
 def select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
-    """Return rows with these columns of the plants of these names, AT_ONCE in one question."""
+    """Return rows with these columns of the stored plants of these names, which are asked for AT_ONCE by AT_ONCE."""
     results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
         results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
