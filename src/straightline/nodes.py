@@ -72,7 +72,7 @@ class Block:
         self.seen: dict[Any, Node] = {}
 
     def free_contents(self) -> None:
-        """Empty this block and those inside, so that no number refers to itself and all are freed without a search."""
+        """Empty this block and those inside: without cycles of references all is freed at once, without a search."""
         for statement in self.items:
             if isinstance(statement, Node):
                 statement.value = None
@@ -119,7 +119,7 @@ class Buffer:
 
     @property
     def owner(self) -> "tuple[Buffer, int]":
-        """Return the buffer whose memory this one uses, and the offset in it."""
+        """Return the buffer whose memory this one uses, the outermost that it is `inside`, and the offset in it."""
         if self.inside is None:
             return self, 0
         whole, start = self.inside[0].owner
