@@ -73,7 +73,7 @@ class CompiledFunction:
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
+        """Generate machine code for a first call of these arrays, or of one run; return "", or why LLVM makes none."""
         if self._refusal is None:
             try:
                 if self.once is not None:
@@ -177,7 +177,7 @@ class CompiledFunction:
         list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
-        """Copy the outputs that all runs share from where they were computed, to every run."""
+        """Copy the outputs that all runs share to every run, from their places (bytes) in the shared memory."""
         parts = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
         for array, is_common, offset, buffer in parts:
             if is_common:

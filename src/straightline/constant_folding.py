@@ -68,7 +68,7 @@ def _shift_right_signed(a: Any, b: Any) -> Any:
 
 
 def _divide(a: Any, b: Any) -> Any:
-    """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
+    """Return a / b; of integers rounded toward zero, by 0 all bits set, and the least one by -1 itself, as XLA does."""
     if isinstance(a, np.floating):
         return np.divide(a, b)
     return wrap_integer(_divide_toward_zero(int(a), int(b)) if b else -1, a)
@@ -108,7 +108,10 @@ def _round_away(a: Any) -> Any:
 
 
 def _power(a: Any, b: Any) -> Any:
-    """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
+    """Return a^b as the C library does, by math.pow; NumPy takes the root for b = 1/2, also of -0 and -infinity.
+
+    Where math.pow raises an error, NumPy's infinity or NaN is C's too.
+    """
     try:
         return type(a)(math.pow(a, b))
     except (ValueError, OverflowError):

@@ -249,6 +249,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
     structure: list[Any] = []
 
     def call(*leaves: Any) -> list[Any]:
+        """Return the arrays of the function's results from its arguments' leaves; note the results' `structure`."""
         returned = function(*jax.tree.unflatten(tree, leaves))
         arrays, form = jax.tree.flatten(
             jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _NonArrayPart(x), returned)

@@ -122,7 +122,10 @@ def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarr
 
 
 def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
-    """Return the nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
+    """Return the nodes, loops, guards, buffers and stores that these numbers need, as keys, in an order without chance.
+
+    A set would have an order that changes from process to process, and with it the program's text.
+    """
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
     while waiting:
@@ -206,7 +209,7 @@ def find_fusable_products(items: Iterable[Any]) -> set[Node]:
 
 
 def list_used_nodes(node: Any) -> Sequence[Node]:
-    """Return the nodes that an item of a program uses directly."""
+    """Return the nodes that an item of a program (node, store, guard, loop; a buffer none) uses directly."""
     if isinstance(node, Node):
         return node.args
     if isinstance(node, Store):

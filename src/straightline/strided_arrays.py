@@ -24,6 +24,10 @@ class StridedArray:
         offset: int = 0,
         moves: tuple[tuple[int, Node], ...] = (),
     ):
+        """Make the view whose entry (i, j, ...) is buffer[offset + strides * (i, j, ...) + sum of moves].
+
+        A move is a stride times a node, which data decide.
+        """
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
         self.loaded: tuple[Block, np.ndarray] | None = (
             None  # nodes that load it, after the block that they were made in

@@ -26,7 +26,10 @@ class SummingProgram:
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
-        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number."""
+        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number.
+
+        That argument alone differs between runs. `once` computes what all runs share, `blocks` all else.
+        """
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]

@@ -266,7 +266,10 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
     arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
 
     def call(*values: Any) -> PyTree:
-        """Call the function with these values of the arrays, put where `leaves` has the placeholder of an array."""
+        """Return the result of the function in the tree, with these values where `leaves` has an array's placeholder.
+
+        The tree (`structure`) is (function, *arguments): also the function may hold arrays.
+        """
         items = iter(values)
         with_values = [next(items) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
         function, *arguments = jax.tree.unflatten(structure, with_values)

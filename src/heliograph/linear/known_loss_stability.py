@@ -173,7 +173,10 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
-    """Return the largest change of an entry of the gains, relative to the largest entry after it."""
+    """Return the largest change of an entry of the gains of all kinds, relative to the largest entry of those `after`.
+
+    0 if these are all zero.
+    """
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0

@@ -63,7 +63,11 @@ def critical_arrival(
     no_outputs = np.zeros((0, len(a)))  # C of a lost packet
 
     def certified_gain(arrival: float) -> Float[np.ndarray, "n m"] | None:
-        """Return a gain that is certified to keep the error bounded at this probability of arrival, or None."""
+        """Return a gain that is certified to keep the error bounded at this probability of arrival, or None.
+
+        a, q, c, r: the plant's A and Cov(w), the sensor's C and Cov(v). `fixed` is a gain that was given, which alone
+        is tried; certified is one under which the radius of the error covariance's step is below 1.
+        """
         # Independent losses as a chain of two modes with equal rows: mode 0 arrived, mode 1 lost, of no outputs.
         chain = np.array([[arrival, 1 - arrival]] * 2)
         system = KnownLossSystem(

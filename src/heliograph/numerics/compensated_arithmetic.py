@@ -182,7 +182,7 @@ class _CompensatedEvaluation:
         return a
 
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
-        """Return the running sums along an axis, from its first entry on or from its last."""
+        """Return the running sums along an axis, from its first entry on or from its last, with what rounding loses."""
         parts = _split_along_axis(a, axis)
         if reverse:
             for i in reversed(range(len(parts) - 1)):

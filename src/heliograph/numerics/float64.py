@@ -187,6 +187,7 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the compiled function in double precision, for NumPy arrays; inside a trace the plain function."""
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         refuse_forked_process()

@@ -201,7 +201,7 @@ def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
 
 
 def _round_numbers(numbers: object) -> str:
-    """Return a number, or a list of lists of them, with four digits each."""
+    """Return a number, or lists of them within lists, as text with four digits each."""
     if isinstance(numbers, list):
         return f"[{', '.join(map(_round_numbers, numbers))}]"
     return f"{numbers:.4g}"

@@ -174,7 +174,10 @@ def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[.
 
 
 def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
-    """Apply a function to one entry of a batch after another; `axes`: 0 for leaves that have a batch, else None."""
+    """Return a function's results for one entry of a batch after another, stacked: `vmap` in a loop.
+
+    `axes` is 0 for leaves that have a batch, along their first axis, and None for those that all entries share.
+    """
 
     def call(entries: list[Any]) -> list[Any]:
         """Call the function for one entry of each leaf that has a batch."""

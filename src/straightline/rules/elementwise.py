@@ -38,7 +38,7 @@ def _make_elementwise_rule(op: str) -> Rule:
     """Return the rule of an operation that is applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return a node of the operation for each entry of the result."""
+        """Return a node of the operation `op` for each entry of the result, of the arguments' entries there."""
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
         return [
             arrange_nodes(
@@ -53,7 +53,7 @@ def _make_rule_of_entries(function: Any) -> Rule:
     """Return the rule that makes each entry of the result by function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return what the function makes of the arguments' entries, for each entry of the result."""
+        """Return for each entry of the result what `function` makes of the arguments' entries there."""
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
         entries = zip(*broadcast_entries(inputs, shape), strict=True)
         return [arrange_nodes([function(graph, type, equation.params, *entry) for entry in entries], shape)]
@@ -133,7 +133,7 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return 1 / (1 + e^-x)."""
+    """Return the node of the logistic function 1 / (1 + e^-x); `params`, those of the operation, are not used."""
     unit = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
     return graph.node("div", type, unit, graph.node("add", type, unit, power))
@@ -160,7 +160,7 @@ def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
-    """Evaluate a polynomial by Horner's rule, of coefficients from degree 0 up."""
+    """Return the node of c_0 + c_1 x + c_2 x^2 + ... by Horner's rule; `params`, of the operation, are not used."""
     value = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         value = graph.node("add", type, graph.node("mul", type, value, x), c)

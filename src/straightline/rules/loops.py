@@ -97,9 +97,9 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> StridedArray:
-    """Store one turn's array as one row of memory; return the array (length, ...) of all turns.
+    """Store one turn's array as one row of memory in the block `outer`; return the array (length, ...) of all turns.
 
-    The row's number is that of the turn, `counter`, or counted from the last row back.
+    The row's number is that of the turn, `counter`, or, `backwards`, counted from the last row back.
     """
     flat = _list_nodes_of_numbers(value)
     type: Type = flat[0].type if flat else "f64"
@@ -209,6 +209,7 @@ class CarriedMemory:
     """
 
     def __init__(self, lowering: Lowering, start: Value):
+        """Make memory for an array that a loop carries, with `start` copied into it before the first turn."""
         self._graph = lowering.graph
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
@@ -335,7 +336,7 @@ def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old:
 
 
 def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
-    """Estimate the count of numbers that a traced program computes: a scan's body once a turn, a while loop's once."""
+    """Return about how many numbers a traced program computes: a scan's body in each turn, a while loop's once."""
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0

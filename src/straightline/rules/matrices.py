@@ -219,6 +219,7 @@ def _for_each_matrix(function: Any) -> Rule:
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return what `function` makes of the matrices at each place on the axes before the last two, one by one."""
         flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
         items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
         return [arrange_nodes((x for item in items for x in item.ravel().tolist()), result_shape(equation))]

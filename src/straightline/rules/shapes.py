@@ -118,7 +118,10 @@ def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: 
 def _update_at(
     lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
 ) -> np.ndarray:
-    """Return x with `update` put at these starts; along the one axis whose start is None, at `here`."""
+    """Return x with `update` put at these starts, one for each axis; along the one whose start is None, at `here`.
+
+    Along any other axis a start must be known, or the update as long as x, so that there is one place.
+    """
     ranges = []
     for size, length, start in zip(update.shape, x.shape, starts, strict=True):
         has_one_place = length == size

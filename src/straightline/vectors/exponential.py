@@ -86,7 +86,10 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
 
 
 def expm1(x: Vector) -> Vector:
-    """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
+    """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels.
+
+    n is the integer nearest to x / ln 2, and r = x - n ln 2. Below -50 the result is -1 to the last digit, as at -50.
+    """
     form = find_format(x)
     count, n = round_to_nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
@@ -98,7 +101,7 @@ def expm1(x: Vector) -> Vector:
 
 
 def log(x: Vector) -> Vector:
-    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
+    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2); -infinity of 0, NaN below."""
     # A subnormal x is made a normal number by a power of two, which is taken off its exponent.
     form = find_format(x)
     is_subnormal, power = x < form.tiny, form.fraction + 2
@@ -118,7 +121,10 @@ def log1p(x: Vector) -> Vector:
 
 
 def tanh(x: Vector) -> Vector:
-    """Return -t / (2 + t), t = e^(-2|x|) - 1; beyond 1/2, 1 - 2 / (2 + t), t = e^(2|x|) - 1."""
+    """Return the hyperbolic tangent, with the sign of x, of |x|: -t / (2 + t), t = e^(-2|x|) - 1.
+
+    Beyond 1/2 it is 1 - 2 / (2 + t), t = e^(2|x|) - 1: each form is precise where it is used.
+    """
     size = abs(x)
     large = size > 0.5
     t = expm1(select(large, 2 * size, -2 * size))

@@ -46,7 +46,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
 def how_to_install(extra: str) -> str:
     """Return a command that installs an extra (a set of optional packages) for this Python.
 
-    From a clone of the repository by its folder, since its version may be in no index.
+    From a clone of the repository by its folder, since no index may have it.
     """
     clone = Path(heliograph.__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "heliograph"

@@ -129,7 +129,7 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
 
 
 def _is_date_label(part: object) -> bool:
-    """Return whether a label is a date: of a class of dates, or a text that reads as one."""
+    """Return whether a row's label is a date: of a class of dates, or a text that reads as one."""
     if isinstance(part, str):
         return looks_like_date(part)
     return _is_date(part)
