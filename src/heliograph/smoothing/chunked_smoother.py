@@ -43,7 +43,7 @@ class SmoothedRows(NamedTuple):
 def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     """Smooth rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
 
-    Forgets: two laws with which a chunk might begin must become one within it.
+    A filter forgets how it began: from any two states it comes, over enough rows, to the same one.
 
     Args:
         filter: the filter, which can be smoothed.
