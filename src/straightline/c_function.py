@@ -132,14 +132,20 @@ def to_c(
 
 
 def _refuse_random_numbers(equations: Sequence[Any]) -> None:
-    """Raise Unsupported for the first operation that draws random numbers, with its line."""
+    """Raise Unsupported, with its line of code, for the first operation that draws random numbers.
+
+    RANDOM are the beginnings of their names in JAX.
+    """
     for equation in equations:
         if equation.primitive.name.startswith(RANDOM):
             raise Unsupported(equation.primitive.name, code_line(equation))
 
 
 def _describe_arguments(names: Sequence[str], buffers: Sequence[Buffer], real: Real) -> list[CArray]:
-    """Describe the arrays that a C function reads, one for each input; numbers without axes are passed by value."""
+    """Describe the arguments of a C function, one for each input; a number without axes is passed by value.
+
+    `real` is the C type of real numbers, double or float.
+    """
     return [
         CArray(name=name, type=_name_stored_type(b.type, real), size=b.size, is_array=bool(b.shape))
         for name, b in zip(names, buffers, strict=True)
@@ -163,7 +169,10 @@ def _make_entry_expression(array: CArray) -> Place:
 
 
 def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequence[Sequence[Node]]) -> list[str]:
-    """Return the lines that write every result, `flat` its nodes; a flag is written as a byte."""
+    """Return the lines of C that write every result, entry by entry; a flag is written as a byte.
+
+    `flat` has for each result the nodes (scalar operations) of its entries, whose C variables `source` names.
+    """
     return [
         f"    {x.name}[{i}] = {'(unsigned char)' if node.type == 'bool' else ''}{source.name_node(node)};"
         for x, nodes in zip(results, flat, strict=True)
@@ -172,7 +181,7 @@ def _write_assignments(source: CSource, results: Sequence[CArray], flat: Sequenc
 
 
 def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[CArray]) -> str:
-    """Return the head of the function."""
+    """Return the head of a C function, with its arguments and results; one of over 100 characters on several lines."""
     every = [*(x.argument_declaration for x in arguments), *(x.result_declaration for x in results)]
     line = f"void {name}({', '.join(every)})"
     return line if len(line) <= 100 else f"void {name}(\n    " + ",\n    ".join(every) + ")"
@@ -199,7 +208,7 @@ def _describe_results(
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
-    """Return whether a matrix has the same node in entries across the diagonal."""
+    """Return whether a matrix of nodes, of two rows or more, has the same node (operation) across its diagonal."""
     if value.ndim != 2 or value.shape[0] != value.shape[1] or len(value) < 2:
         return False
     return all(value[i, j] is value[j, i] for i in range(len(value)) for j in range(i))
@@ -229,7 +238,7 @@ def _name_arrays(
 
 
 def _name_leaves(label: str, tree: PyTree) -> list[str]:
-    """Return a name in C for each array of a tree, from its place in it."""
+    """Return a name in C for each array of a tree: `label` and its path, as in state_speed_0; other signs become _."""
     results = []
     for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]:
         parts = [str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path]
@@ -245,7 +254,7 @@ def _find_code_line(operation: str, equations: Sequence[Any]) -> str:
 
 
 def _yield_equations(jaxpr: Any) -> Iterator[Any]:
-    """Yield all operations, also those of inner programs."""
+    """Yield all operations of a traced program, also those of programs within (loops, branches, calls)."""
     for equation in jaxpr.eqns:
         yield equation
         for param in equation.params.values():

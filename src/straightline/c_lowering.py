@@ -34,11 +34,15 @@ class ZeroFoldingGraph(Graph):
 
     def __init__(self) -> None:
         super().__init__()
+        # What is finite for certain: 0 times such a number is 0, and needs no operation.
         self.finite_buffers: set[Buffer] = set()  # inputs that hold no NaN
         self.finite: set[Node] = set()  # numbers that follow from these alone
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """Make a node, with products of zero and a finite number simplified."""
+        """Return a node (scalar operation), 0 for a product of zero and a number that is finite whatever the data.
+
+        PRESERVING operations, and selections, of finite numbers are finite: so notes `finite` what follows from those.
+        """
         if op == "mul" and type in REAL:
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
@@ -50,7 +54,7 @@ class ZeroFoldingGraph(Graph):
         return made
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Load a number; note that it is finite if all of its buffer are."""
+        """Return the node of buffer[offset + sum strides * indices]; note it as finite if all of its buffer are."""
         made = super().load(buffer, offset, strides, indices)
         if buffer in self.finite_buffers:
             self.finite.add(made)
@@ -69,13 +73,19 @@ class CLowering(Lowering):
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Lower one operation; arithmetic is written out unless its arrays are too long."""
+        """Return the results of one operation of JAX; arithmetic is written out entry by entry.
+
+        So arrays in memory are loaded first, unless they have more than LOADED numbers, or are only viewed (VIEWS).
+        """
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
             inputs = [self.nodes(x) if isinstance(x, StridedArray) and x.size <= LOADED else x for x in inputs]
         return super().lower_equation(equation, inputs)
 
     def make_known_array(self, number: Any) -> Value:
-        """Place an array of known numbers in memory; an entry at a known place is a constant."""
+        """Return an array of known numbers as a table in memory, of which an entry at a known place is a constant.
+
+        Single numbers, empty arrays and keys of random numbers are made as elsewhere.
+        """
         if not isinstance(number, np.ndarray | np.generic | jax.Array) or not np.shape(number) or not np.size(number):
             return super().make_known_array(number)
         if isinstance(number, np.ndarray) and number.dtype == object:

@@ -54,7 +54,7 @@ UNSIGNED: dict[str, Callable[..., str]] = {
 
 
 def c_type(type: Type, real: Real) -> str:
-    """Return the C type of a number in the program."""
+    """Return the C type of a number in the program; `real` is that of double precision, "double" or "float"."""
     if type in REAL:
         return real if type == "f64" else "float"
     return {"bool": "int", "i32": "int32_t", "i64": "int64_t", "u32": "uint32_t", "u64": "uint64_t"}[type]
@@ -136,7 +136,11 @@ def write_expression(node: Node, arguments: Sequence[str], real: Real) -> str:
 
 
 def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
-    """Return the C expression of an operation on integers, defined where C leaves it open (overflow, long shifts)."""
+    """Return the C expression of an operation on integers, defined where C leaves it open (overflow, long shifts).
+
+    So it is computed on unsigned numbers. UNSIGNED and WHOLE are the templates by operation; the first has those that
+    are simpler for unsigned types.
+    """
     bits, is_unsigned = int(type[1:]), type[0] == "u"
     unsigned, signed = f"uint{bits}_t", f"int{bits}_t"
     if is_unsigned and op in UNSIGNED:
@@ -149,7 +153,10 @@ def _write_integer(op: str, type: Type, arguments: Sequence[str]) -> str:
 
 
 def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
-    """Return the expression of a number in another type; of a real one truncated, within the type; 0 of NaN."""
+    """Return the C expression of a number in another type.
+
+    A real one as an integer is truncated, the type's limit where it is beyond, and 0 of NaN; as a flag it is != 0.
+    """
     if target == "bool":
         return f"({name} != 0)"
     kind = c_type(target, real)
@@ -168,7 +175,8 @@ def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
 def _write_bitcast(source: Type, target: Type, name: str, real: Real) -> str:
     """Return the expression that reads the bits of a number as another type, by a union.
 
-    A number of single precision is one of double precision then.
+    Integers alone need none, but a cast. In the union a real number has its own width, whatever precision the C
+    computes in.
     """
     if not {source, target} & REAL:
         return f"({c_type(target, real)}){name}"
@@ -206,9 +214,9 @@ class CSource:
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
-        """Return a number as the end of a range: the largest of the precision in place of one beyond it.
+        """Return the text of a number that bounds a range; in float, a constant beyond float's largest becomes that.
 
-        A limit that float does not have limits no float, and `write_literal` would refuse it.
+        Such a bound bounds no float, and `write_literal` would refuse it as a literal.
         """
         if node.op != "constant" or self.real != "float" or not math.isfinite(node.value):
             return self.name_node(node)
@@ -254,7 +262,7 @@ class CSource:
         return f"v{self.count}"
 
     def _write_node(self, node: Node, indent: str) -> list[str]:
-        """Return the line of C that computes a node; none for a constant or a number that exists already."""
+        """Return the line of C that computes a node into a variable; none for a constant or what has a name already."""
         if node.op in ("constant", "counter", "parameter", "result", "guarded"):
             return []
         if node.op == "load":
@@ -268,7 +276,11 @@ class CSource:
         return [f"{indent}const {c_type(node.type, self.real)} {self.names[node]} = {text};"]
 
     def _write_entry(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
-        """Return the expression of buffer[offset + sum strides * indices]; a buffer may be part of another array."""
+        """Return the expression of buffer[offset + sum strides * indices] in C.
+
+        A buffer may be a part of a larger one, `whole`, from `start` on. That is a table of constants, an argument or
+        result (`places` says how an entry of it is written), or a local array.
+        """
         whole, start = buffer.owner
         index = self._write_index(start + offset, strides, indices)
         if whole.table is not None:
@@ -278,14 +290,14 @@ class CSource:
         return f"{self.arrays.setdefault(whole, f'a{len(self.arrays)}')}[{index}]"
 
     def _write_index(self, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> str:
-        """Return the expression offset + sum strides * indices."""
+        """Return the C expression offset + sum strides * indices, without factors 1 and a zero offset."""
         terms = [
             f"{s} * {self.name_node(i)}" if s != 1 else self.name_node(i) for s, i in zip(strides, indices, strict=True)
         ]
         return " + ".join(([str(offset)] if offset or not terms else []) + terms)
 
     def _name_table(self, buffer: Buffer) -> str:
-        """Return the name of the constant array that holds a buffer's numbers, written once for equal ones."""
+        """Return the name of the C constant array that holds a table's numbers; equal tables share one."""
         assert buffer.table is not None
         values: np.ndarray = np.ascontiguousarray(buffer.table)
         key = (buffer.type, values.tobytes())
@@ -325,7 +337,10 @@ class CSource:
         return [*lines, f"{indent}}}"]
 
     def _write_loop_head(self, loop: Loop) -> str:
-        """Return the `for` of a loop, with a counter if its length is known; note the counter's name."""
+        """Return the `for` of a loop, with a counter if its length is known; note the name of the counter's node.
+
+        A loop of unknown length ends by a check within it.
+        """
         if loop.length is None:
             return "for (;;) {"
         counter = self._new_name()
@@ -334,7 +349,11 @@ class CSource:
         return f"for (int64_t {counter} = 0; {counter} < {loop.length}; ++{counter}) {{"
 
     def _write_guard(self, guard: Guard, indent: str) -> list[str]:
-        """Return the lines of a guarded block, after `indent`; its results are zero if the condition does not hold."""
+        """Return the lines of a guarded block: an `if`; its results are zero where the condition does not hold.
+
+        A result's variable is declared as 0 before, and gets its value at the block's end. `needed` are the nodes that
+        the C function's results need.
+        """
         results = [(r, v) for r, v in zip(guard.results, guard.values, strict=True) if r in self.needed]
         lines = []
         for outcome, _ in results:
@@ -346,7 +365,7 @@ class CSource:
 
 
 def _wrap_numbers(numbers: Sequence[str]) -> list[str]:
-    """Return numbers separated by commas, as lines of at most the width of the file."""
+    """Return the texts of numbers, each with a comma, as indented lines of at most WIDTH characters."""
     lines, line = [], "   "
     for number in numbers:
         if len(line) + len(number) + 2 > WIDTH:

@@ -11,7 +11,10 @@ from straightline.result_memory import align_to_cache_line
 
 
 def convert_to_memory(x: Any, dtype: Any) -> np.ndarray:
-    """Return an argument of a call as contiguous numbers of a type; a key of random numbers as its words."""
+    """Return an argument of a call as contiguous numbers of a type; a key of random numbers as its words.
+
+    Real numbers are not made whole ones: they are refused where an integer or a flag is expected.
+    """
     if type(x) is np.ndarray and x.dtype == dtype and x.flags.c_contiguous:
         return x
     if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):

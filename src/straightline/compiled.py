@@ -55,7 +55,7 @@ class CompiledFunction:
         self._shared: np.ndarray | None = None  # what all runs of all calls share, once it is computed
 
     def with_first_arguments(self, *arguments: PyTree) -> "CompiledFunction":
-        """Return the same code whose first arguments are these, which calls leave out."""
+        """Return the same code with its first arguments (leaves) bound to these, which calls then leave out."""
         new = copy(self)
         new._first = [convert_to_memory(x, t) for x, t in zip(jax.tree.leaves(arguments), self.types, strict=False)]
         new._check_shapes(new._first, 0, new._count_runs(new._first))
@@ -73,7 +73,7 @@ class CompiledFunction:
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate what a first call of these arrays, or of one run, takes; return "", or why LLVM makes no code."""
+        """Generate machine code for a first call of these arrays, or of one run; return "", or why LLVM makes none."""
         if self._refusal is None:
             try:
                 if self.once is not None:
@@ -95,7 +95,7 @@ class CompiledFunction:
         return 1 if self._by_run is None or self._by_run >= len(arrays) else len(arrays[self._by_run])
 
     def _convert_arguments(self, arguments: PyTree) -> list[np.ndarray]:
-        """Return all arguments of a call, the first ones included, of the types and shapes that the code has."""
+        """Return the bound first arguments and a call's own, leaf by leaf, of the types and shapes that code has."""
         leaves, count = jax.tree.leaves(arguments), len(self._first)
         if len(leaves) != len(self.types) - count:
             raise ValueError(f"arguments: expected {len(self.types) - count} arrays, got {len(leaves)}")
@@ -104,7 +104,7 @@ class CompiledFunction:
         return arrays
 
     def _check_shapes(self, arrays: Sequence[np.ndarray], first: int, runs: int) -> None:
-        """Check arrays that are arguments from number `first` on; what calls leave out is checked once."""
+        """Raise unless arrays, arguments from number `first` on, have their shapes, led by `runs` where runs differ."""
         expected = zip(arrays, self.shapes[first:], self.differs[first:], strict=False)
         for number, (x, shape, differs) in enumerate(expected, first):
             if x.shape != ((runs, *shape) if differs else shape):
@@ -146,7 +146,8 @@ class CompiledFunction:
     def _compute_shared(self, arrays: list[np.ndarray], outputs: list[np.ndarray]) -> np.ndarray:
         """Return the memory of what all runs share, computed from a call's arguments; copy shared results to `outputs`.
 
-        It is kept for later calls where it follows from the first arguments alone, which calls leave out.
+        `once` computes it, None if there is nothing. It is kept for later calls where it follows from the bound first
+        arguments alone: where all others differ between runs.
         """
         if self.once is None:
             return allocate_aligned(self.code.shared)
@@ -165,7 +166,7 @@ class CompiledFunction:
         return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
     def _compute_blocks(self, call: "MemoryOfCall", cores: int | None) -> None:
-        """Compute all blocks of runs of a call: here if that is little work, else shared among threads."""
+        """Compute all blocks of a call, each the runs of one vector: here if that is little work, else in threads."""
         blocks, scratch, work = -(-call.runs // call.machine.width), self.code.scratch, self.code.blocks.work
         # Blocks of a thread's part: an even share, but no less than is worth a thread. -(-a // b) is a / b rounded up.
         share = max(-(-blocks // ((cores or cpu_count()) * SHARES)), -(-LITTLE // max(work, 1)))
@@ -176,7 +177,7 @@ class CompiledFunction:
         list(get_thread_pool().map(lambda start: call.compute(start, min(start + share, blocks), scratch), starts))
 
     def _copy_shared_outputs(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
-        """Copy the outputs that all runs share from where they were computed, to every run."""
+        """Copy the outputs that all runs share to every run, from their places (bytes) in the shared memory."""
         parts = zip(outputs, self.code.common, self.code.places, self.code.outputs, strict=True)
         for array, is_common, offset, buffer in parts:
             if is_common:
@@ -247,7 +248,7 @@ class InPlaceCode:
         return inputs
 
     def __call__(self) -> None:
-        """Compute `outputs` from `inputs`."""
+        """Compute `outputs` from `inputs`: first what all runs share, if it varies; here if little, else in threads."""
         if self._shared_varies and self._compiled.once is not None:
             self._compute_shared(self._compiled.once)
         if self._is_common:
@@ -280,13 +281,13 @@ class SingleRunCode:
         self._allocate_memory([])
 
     def with_new_memory(self, first: Sequence[np.ndarray]) -> "SingleRunCode":
-        """Return the same code with new memory; the first arguments are these arrays, which a call only reads."""
+        """Return the same code with memory of its own, in which the first arguments are these, only read by a call."""
         new = copy(self)
         new._allocate_memory(first)
         return new
 
     def _allocate_memory(self, first: Sequence[np.ndarray]) -> None:
-        """Allocate the memory of calls, in which the first arguments are these arrays and results may be arguments."""
+        """Allocate the arrays of calls; results in `_in_place` (result: argument) are written over their argument."""
         kinds = self._arguments
         self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
         self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]

@@ -38,7 +38,7 @@ class NodeMaker(Protocol):
 
 
 def wrap_integer(number: int, like: Any) -> Any:
-    """Return the integer of a type that has the lowest bits of a number."""
+    """Return a number as an integer of the type of `like`: its lowest bits, as arithmetic that overflows has them."""
     kind = type(like)
     bits = 8 * like.itemsize
     rest = number % (1 << bits)
@@ -57,7 +57,10 @@ def _shift_right(a: Any, b: Any) -> Any:
 
 
 def _shift_right_signed(a: Any, b: Any) -> Any:
-    """Return a >> b with copies of the highest bit from the left, also of an unsigned a; all copies for a large b."""
+    """Return a >> b with copies of the highest bit from the left, also of an unsigned a; all copies if b is too large.
+
+    That is a b below 0 or of all bits or more.
+    """
     last = 8 * a.itemsize - 1
     is_negative = int(a) >> last == 1  # an unsigned number whose highest bit is set is read as one below zero
     signed = int(a) - (1 << last + 1) if is_negative else int(a)
@@ -65,14 +68,14 @@ def _shift_right_signed(a: Any, b: Any) -> Any:
 
 
 def _divide(a: Any, b: Any) -> Any:
-    """Divide; integers toward zero, by 0 to all bits set, the least one by -1 to itself."""
+    """Return a / b; of integers rounded toward zero, by 0 all bits set, and the least one by -1 itself, as XLA does."""
     if isinstance(a, np.floating):
         return np.divide(a, b)
     return wrap_integer(_divide_toward_zero(int(a), int(b)) if b else -1, a)
 
 
 def _remainder(a: Any, b: Any) -> Any:
-    """Return what is left of a division, with the sign of a; of integers by 0 all."""
+    """Return what is left of a / b, with the sign of a; of an integer by 0 all of a is left."""
     if isinstance(a, np.floating):
         return np.fmod(a, b)
     return wrap_integer(int(a) - _divide_toward_zero(int(a), int(b)) * int(b) if b else int(a), a)
@@ -105,7 +108,10 @@ def _round_away(a: Any) -> Any:
 
 
 def _power(a: Any, b: Any) -> Any:
-    """Compute a^b as the C library does; NumPy takes the root for b = 1/2, also of -0 and -infinity."""
+    """Return a^b as the C library does, by math.pow; NumPy takes the root for b = 1/2, also of -0 and -infinity.
+
+    Where math.pow raises an error, NumPy's infinity or NaN is C's too.
+    """
     try:
         return type(a)(math.pow(a, b))
     except (ValueError, OverflowError):
@@ -113,7 +119,10 @@ def _power(a: Any, b: Any) -> Any:
 
 
 def _convert_number(a: Any, kind: Any) -> Any:
-    """Convert a number; of a real one that an integer type does not have the nearest that it has, 0 of NaN."""
+    """Return a number as one of the type `kind`.
+
+    A real one as an integer is truncated, the type's limit where it is beyond, and 0 of NaN.
+    """
     if not isinstance(a, np.floating) or kind in (np.float64, np.float32, np.bool_):
         return a.astype(kind)
     ends = np.iinfo(kind)
@@ -136,7 +145,10 @@ EVALUATED: dict[str, Callable[..., Any]] = {
 
 
 def fold_node(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
-    """Return an existing or simpler node of the same value; None if there is none."""
+    """Return an existing or simpler node of the same value as op(args), a constant if all args are; None if none is.
+
+    SIMPLER has a rule for the operations that can be simplified.
+    """
     for a in args:
         if a.op != "constant":
             rule = SIMPLER.get(op)
@@ -175,7 +187,7 @@ def _is_constant(node: Node, number: float) -> bool:
 
 
 def is_finite(node: Node) -> bool:
-    """Return whether a number is finite whatever the data."""
+    """Return whether a number is known to be finite (no NaN, no infinity) whatever the data; False if not known."""
     if node.type not in REAL or (node.op == "constant" and math.isfinite(node.value)):
         return True
     if node.op == "convert":
@@ -184,7 +196,7 @@ def is_finite(node: Node) -> bool:
 
 
 def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a + b: x + 0 = x, a + (-x) = a - x; None where nothing is simpler."""
+    """Return a simpler node for a + b, by x + 0 = x and a + (-x) = a - x; None where nothing is simpler."""
     if a.op == "constant" and a.value == 0:
         return b
     if b.op == "constant" and b.value == 0:
@@ -197,7 +209,7 @@ def _fold_add(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a - b: x - 0 = x, -0 - x = -x, a - (-x) = a + x; None where nothing is simpler."""
+    """Return a simpler node for a - b, by x - 0 = x, -0 - x = -x and a - (-x) = a + x; None if nothing is simpler."""
     if _is_constant(b, 0):
         return a
     if type in REAL and _is_constant(a, 0) and math.copysign(1, a.value) < 0:  # 0 - 0 is 0, but -0 of -x
@@ -228,7 +240,7 @@ def _fold_mul(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_div(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Replace a division by a power of two by the product with its reciprocal, which is exact."""
+    """Return a / b for a power of two b as the product with its reciprocal, which is exact; None for any other b."""
     if type not in REAL or b.op != "constant" or not b.value or not math.isfinite(b.value):
         return None
     # A power of two has the mantissa 1/2; both it and its reciprocal must be normal numbers.
@@ -244,7 +256,7 @@ def _fold_neg(graph: NodeMaker, type: Type, a: Node) -> Node | None:
 
 
 def _fold_and(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a & b where one is a constant flag or both are the same; None where nothing is simpler."""
+    """Return a simpler node for a & b where one is a constant flag or both are the same node; else None."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and type == "bool":
@@ -253,7 +265,7 @@ def _fold_and(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_or(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a | b where one is a constant or both are the same; None where nothing is simpler."""
+    """Return a simpler node for a | b where one is a constant flag or 0, or both are the same node; else None."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and type == "bool":
@@ -264,7 +276,7 @@ def _fold_or(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_xor(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a ^ b where one is zero, or a constant flag; None where nothing is simpler."""
+    """Return a simpler node for a ^ b (exclusive or) where one is 0 or a constant flag; None for any other."""
     if b.op == "constant":
         a, b = b, a
     if a.op == "constant" and not a.value:
@@ -288,7 +300,10 @@ def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | Non
 
 
 def _fold_select(graph: NodeMaker, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
-    """Simplify a choice by a condition known, negated, or that of an inner choice; None where nothing is simpler."""
+    """Return a simpler node for `a where the condition holds, else b`; None where nothing is simpler.
+
+    So it is where the condition is known or negated, where a choice within has the same one, or between two flags.
+    """
     if a is b:
         return a
     if condition.op == "constant":
@@ -308,7 +323,10 @@ def _make_equality_rule(op: str) -> Callable[..., Node | None]:
     """Return the rule that simplifies == or !=."""
 
     def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-        """Simplify a comparison of a flag with a constant to the flag, and one of a number with itself."""
+        """Return a comparison (`op` is "eq" or "ne") of a flag with 0 or 1 as the flag or its negation; else None.
+
+        One of a number with itself is a constant, unless that may be NaN, which equals nothing.
+        """
         if a is b and (a.type not in REAL or a in graph.never_nan or is_finite(a)):
             return graph.constant(op == "eq", "bool")
         if a.op == "constant":
@@ -324,10 +342,16 @@ def _make_equality_rule(op: str) -> Callable[..., Node | None]:
 
 
 def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | None]:
-    """Return the rule that writes an order of flags as logic; `strict`: < rather than <=, `turned`: > for <."""
+    """Return the rule that writes an order of flags, false before true, as logic.
+
+    `strict`: < rather than <=; `turned`: > for <, or >= for <=.
+    """
 
     def fold_flag_order(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-        """Write the order of two flags, false before true, as logic: LLVM has no such comparison of vectors of them."""
+        """Return the order of two flags, false before true, as logic, since LLVM compares no flags; None of numbers.
+
+        `strict`: a < b rather than a <= b; `turned`: b comes first.
+        """
         if a.type != "bool":
             return None
         # low < high is "not low and high", low <= high is "not low or high".
@@ -338,7 +362,10 @@ def _make_flag_order_rule(strict: bool, turned: bool) -> Callable[..., Node | No
 
 
 def _fold_convert(graph: NodeMaker, type: Type, a: Node) -> Node | None:
-    """Simplify a conversion: of the same type, there and back, or to a flag (x != 0); None where nothing is simpler."""
+    """Return a simpler node for a converted to a type: itself if it has it, what it was before if nothing was lost.
+
+    A flag is written as a != 0. None where nothing is simpler.
+    """
     if a.type == type:
         return a
     if type == "f32" and a.op == "convert" and a.args[0].type == "f32" and a.type == "f64":  # nothing was lost

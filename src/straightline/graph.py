@@ -27,7 +27,10 @@ class Graph:
         self.never_nan: set[Node] = set()  # nodes that are known not to be NaN, whatever the data
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
-        """Return a node of an operation: a constant, an existing equal node, or a new one."""
+        """Return a node of an operation: a constant, a simpler or an equal node that exists, or a new one.
+
+        Arguments of COMMUTATIVE operations are put in one order, so that a + b and b + a are one node.
+        """
         simpler = fold_node(self, op, type, args)
         if simpler is not None:
             return simpler
@@ -36,7 +39,7 @@ class Graph:
         return self._find_or_make(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
-        """Make a constant, rounded to single precision if it is of that type."""
+        """Return the node of a constant, one for equal ones, rounded to single precision if it is of that type."""
         value = DTYPES[type](value).item() if type == "f32" else value
         key = (type, value if value != 0 or type not in REAL else str(value))  # 0.0 == -0.0, but they differ
         known = self.top.seen.get(key)
@@ -45,7 +48,11 @@ class Graph:
         return known
 
     def make_fresh_node(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
-        """Make a node that equals no other, and that no block contains yet."""
+        """Return a new node, that no other stands for, with the next number (`serial`); no block contains it yet.
+
+        Raises:
+            Unsupported: a program of too many operations.
+        """
         self.serial += 1
         if self.serial > self.max_nodes:
             raise Unsupported(f"a program of more than {self.max_nodes} operations")
@@ -53,7 +60,10 @@ class Graph:
 
     @contextmanager
     def limit_new_nodes(self, count: int) -> Iterator[None]:
-        """Allow so many more nodes; if there are more, which is refused, the block that was open is open again."""
+        """Allow so many more nodes within the block; one more raises Unsupported, as does one above the whole limit.
+
+        At the end, also then, the limit is as before, and the block of operations that was open is open again.
+        """
         before, block = self.max_nodes, self.current
         self.max_nodes = min(before, self.serial + count)
         try:
@@ -62,7 +72,7 @@ class Graph:
             self.max_nodes, self.current = before, block
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
-        """Load buffer[offset + sum strides * indices], after the buffer is filled."""
+        """Return the node of buffer[offset + sum strides * indices], no further out than the block that fills that."""
         # Indices that are known become part of the offset.
         open_pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
@@ -78,7 +88,7 @@ class Graph:
         return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
-        """Store a number, in the open block."""
+        """Add to the open block the statement buffer[offset + sum strides * indices] = node."""
         written = Store(self.current, buffer, node, offset, strides, indices)
         buffer.stores.append(written)
         self.current.items.append(written)

@@ -47,7 +47,10 @@ class _JaxEvaluation:
         self.memory: Memory = {}
 
     def evaluate(self, arrays: tuple[Any, ...]) -> list[jax.Array]:
-        """Return the results for these arguments, leaf by leaf."""
+        """Return the results for these arguments, leaf by leaf, by JAX operation for operation of the graph.
+
+        Memory are flat arrays by buffer: inputs, tables, and zeros for what the program will fill.
+        """
         for buffer, array in zip(self.program.inputs, arrays, strict=True):
             self.memory[buffer] = jnp.asarray(array, DTYPES[buffer.type]).reshape(-1)
         for buffer in {x.owner[0] for x in self.needed if isinstance(x, Buffer)} - set(self.memory):
@@ -57,7 +60,10 @@ class _JaxEvaluation:
         return [self._gather_result(x) for x in self.program.outputs]
 
     def _gather_result(self, value: Any) -> jax.Array:
-        """Return an array of the result: its numbers stacked, or read from memory by places and strides."""
+        """Return an array of the result: its nodes' values stacked, or read from memory.
+
+        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + moves: steps times nodes' values.
+        """
         if not isinstance(value, StridedArray):
             nodes = [self.value(n) for n in value.ravel().tolist()]
             return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
@@ -72,7 +78,10 @@ class _JaxEvaluation:
         return jnp.asarray(node.value, DTYPES[node.type]) if node.op == "constant" else self.values[node]
 
     def evaluate_block(self, items: list[Any]) -> None:
-        """Evaluate operations and statements in order."""
+        """Evaluate, in order, what the results need of a block, into `values` (by node) and `memory` (by buffer).
+
+        What a loop or guard sets (counter, parameter, result, guarded) has its value already.
+        """
         for statement in items:
             if statement not in self.needed:  # a check of a loop among them
                 continue
@@ -88,7 +97,7 @@ class _JaxEvaluation:
                 self.values[statement] = self._evaluate_node(statement)
 
     def _evaluate_node(self, node: Node) -> jax.Array:
-        """Compute a node by the operation of JAX that has its name."""
+        """Return a node's value, by the operation of JAX that has its name, or that OPERATIONS has for it."""
         if node.op == "load":
             buffer, offset, strides = node.value
             return self.memory[buffer.owner[0]][self._locate_entry(buffer, offset, strides, node.args)]
@@ -125,7 +134,10 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Make the parameters and the memory those of the carry (numbers, memory)."""
+            """Set values and memory as a turn begins: those from outside, and the carry (numbers, arrays).
+
+            `carried` are the places of the loop's numbers, `filled` the buffers that it fills.
+            """
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
             self.values |= zip((loop.parameters[k] for k in carried), numbers, strict=True)
@@ -133,7 +145,7 @@ class _JaxEvaluation:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
         def run_turn(counter: Any, carry: PyTree) -> PyTree:
-            """Return the carry after the body."""
+            """Return the carry after the body: the numbers `carried`, and the memory of the buffers `filled`."""
             begin_turn(carry, counter)
             self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
@@ -161,7 +173,7 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(guard.body), self.values, self.memory
 
         def evaluate_body() -> PyTree:
-            """Return the block's values, and the memory that it fills."""
+            """Return the guarded block's values that are `used`, and the memory of the buffers that it fills."""
             self.values, self.memory = dict(outer_values), dict(outer_memory)
             self.evaluate_block(guard.body.items)
             return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]

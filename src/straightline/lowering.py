@@ -45,7 +45,7 @@ class Lowering:
     def inline_program(
         self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()
     ) -> list[Value]:
-        """Return the results of a traced program for these arguments."""
+        """Return the results of a traced program for these arguments, operation by operation that they need."""
         jaxpr: Any = program
         if isinstance(program, ClosedJaxpr):
             jaxpr, consts = program.jaxpr, program.consts
@@ -57,7 +57,7 @@ class Lowering:
         return [self._look_up_argument(values, v) for v in jaxpr.outvars]
 
     def lower_whole_program(self, program: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
-        """Return the results of a whole program; an array without entries, which has no node, is a typed view."""
+        """Return the results of a whole program; one without entries has no node, and is an empty view of its type."""
         avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
         values = self.inline_program(program, inputs)
         return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
@@ -67,7 +67,7 @@ class Lowering:
         return StridedArray.of_whole_buffer(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Return the results of one operation.
+        """Return the results of one operation of JAX (`equation`) as nodes or arrays in memory, by its rule.
 
         Raises:
             Unsupported: no rule takes it, or the rule fails, which is said once for a line of code.
@@ -86,7 +86,7 @@ class Lowering:
             raise make_refusal(name, error, code_line(equation)) from error
 
     def _apply_rule(self, equation: JaxprEqn, name: str, inputs: list[Value]) -> Sequence[Value]:
-        """Apply the rule of an operation: in memory if an input is there, else on its entries."""
+        """Return the results by the rule of an operation: IN_MEMORY has those for inputs in memory, RULES for nodes."""
         if name in IN_MEMORY and (name not in RULES or any(isinstance(x, StridedArray) for x in inputs)):
             return IN_MEMORY[name](self, equation, inputs)
         if name not in RULES:
@@ -98,7 +98,7 @@ class Lowering:
         return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
-        """Return the node of a value without axes."""
+        """Return the node of a value of one entry; refuse any other, of which each entry would be a condition."""
         nodes = self.nodes(value)
         if nodes.size != 1:
             raise Unsupported("a condition for each entry of an array")
@@ -106,7 +106,7 @@ class Lowering:
         return node
 
     def make_known_array(self, number: Any) -> Value:
-        """Return an array of known numbers: as constants, or as a table in memory if it is long."""
+        """Return an array of known numbers: as constants, or above TABLE numbers as a table in memory; keys as keys."""
         if isinstance(number, np.ndarray) and number.dtype == object:
             return number
         if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
@@ -128,7 +128,10 @@ def _convert_literal(number: Any, variable: Any) -> Any:
 
 
 def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
-    """Return the refusal of a program whose native code cannot be made for a defect, and say so once for a line."""
+    """Return the refusal (Unsupported) of a program whose native code failed by an error, and warn once for a line.
+
+    Such an error is a defect here, or LLVM's: XLA then computes. `where` is the line of code, "" if not known.
+    """
     refused = Unsupported(f"{operation}, whose native code failed ({type(error).__name__}: {error})", where)
     warn_once(f"no native code: {refused}")
     return refused
@@ -136,7 +139,7 @@ def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
 
 @contextmanager
 def turn_failures_into_refusals(what: str) -> Iterator[None]:
-    """Turn a failure of what makes native code into a refusal."""
+    """Turn any error within the block, which makes native code of `what`, into Unsupported: a refusal."""
     try:
         yield
     except Unsupported:
@@ -152,7 +155,7 @@ def warn_once(text: str) -> None:
 
 
 def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Arrange nodes in row-major order as an array."""
+    """Return nodes, in row-major order, as an array of objects of this shape."""
     flat = list(nodes)
     array = np.empty(len(flat), dtype=object)
     array[:] = flat
@@ -174,6 +177,7 @@ def list_nodes(value: np.ndarray) -> list[Node]:
 def type_of(value: Any) -> Type:
     """Return the type of a number, or of an array's numbers."""
     dtype = value.dtype
+    # NAMES keeps the names of dtypes, which NumPy takes long to spell.
     if dtype not in NAMES:
         NAMES[dtype] = np.dtype(dtype).name
     name = NAMES[dtype]
@@ -199,7 +203,7 @@ def make_placeholder(shape: Sequence[int], dtype: Any) -> Any:
 
 
 def known_integers(value: np.ndarray) -> np.ndarray | None:
-    """Return an array of known integers, None if one of them depends on data."""
+    """Return an array of nodes as integers, None if one of them depends on data (is no constant)."""
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
@@ -207,7 +211,10 @@ def known_integers(value: np.ndarray) -> np.ndarray | None:
 
 
 def code_line(equation: JaxprEqn) -> str:
-    """Return the line of a user's or the library's code that an operation comes from."""
+    """Return the line of code, file:number, that an operation comes from; "" if not known.
+
+    It is the innermost outside of JAX, equinox and this package (HERE).
+    """
     traceback = equation.source_info.traceback
     frames: list[Any] = [] if traceback is None else traceback.frames
     inside = ("/jax/", "/equinox/", HERE)
@@ -242,6 +249,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
     structure: list[Any] = []
 
     def call(*leaves: Any) -> list[Any]:
+        """Return the arrays of the function's results from its arguments' leaves; note the results' `structure`."""
         returned = function(*jax.tree.unflatten(tree, leaves))
         arrays, form = jax.tree.flatten(
             jax.tree.map(lambda x: x if isinstance(x, ARRAYS) else _NonArrayPart(x), returned)
@@ -257,6 +265,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
 def _list_used_equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
     """Return the operations on which a program's results depend, or which do something beside, such as printing."""
+    # From the last operation back, since only then it is known which results of one are needed.
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     used: list[JaxprEqn] = []
     for equation in reversed(jaxpr.eqns):

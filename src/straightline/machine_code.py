@@ -57,6 +57,7 @@ class MachineCode:
         machine = find_llvm_target().create_target_machine(cpu=cpu, features=flags, opt=level)
         module = llvm.parse_assembly(source.text(width))
         module.verify()
+        # An object file first: the engine only loads it.
         code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
         module.close()  # three times the memory of its code
         # An engine that generates the code itself would verify the module again.
@@ -88,10 +89,10 @@ def _get_hasty_thread() -> ThreadPoolExecutor:
 
 @turn_failures_into_refusals("a program")
 def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
-    """Generate code outside of the main thread, and wait for it.
+    """Return machine code, generated outside of the main thread, at LLVM's `level` (0 in haste, 1 with care).
 
-    Python raises what a signal asks for in the main thread, between any two of its operations: an object of LLVM made
-    there could change its owner and nobody note it, and be freed twice.
+    Vectors are of `width` runs. Python raises what a signal asks for in the main thread, between any two of its
+    operations: an object of LLVM made there could change its owner and nobody note it, and be freed twice.
 
     Raises:
         Unsupported: LLVM makes no code of it, which is said once.
@@ -102,7 +103,7 @@ def emit_code(source: FunctionSource, level: int, width: int) -> MachineCode:
 
 
 def _generate_with_care(source: FunctionSource, width: int, hasty: MachineCode) -> MachineCode:
-    """Generate code with care; if that fails, that in haste goes on, and it is said once."""
+    """Return code generated with care (optimised, LLVM's level 1); if that fails, warn once and return `hasty`."""
     try:
         return MachineCode(source, 1, width)
     except Exception as error:
@@ -151,7 +152,7 @@ class TieredCode:
             return machine
 
     def _make_first(self, executions: float) -> MachineCode:
-        """Return the code that is made at the first call, at a level for so many executions."""
+        """Return the code that the first call makes, later ones find: in haste (0) or with care (1) by `executions`."""
         if self._machine is None:
             level = self._choose_level(executions)
             self._machine = emit_code(self._source, level, self._widths[level])

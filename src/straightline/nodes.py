@@ -41,6 +41,7 @@ class Node:
         self.op, self.type, self.args, self.block, self.value, self.serial = op, type, args, block, value, serial
 
     def __repr__(self) -> str:
+        """Return a constant's value, of any other node %7=add(%3, %5), by the serials of it and its arguments."""
         if self.op == "constant":
             return str(self.value)
         return f"%{self.serial}={self.op}({', '.join(f'%{a.serial}' for a in self.args)})"
@@ -65,14 +66,15 @@ class Block:
     __slots__ = ("depth", "items", "owner", "parent", "pinned", "seen")
 
     def __init__(self, parent: "Block | None", pinned: bool = False):
+        """Make an empty block within `parent`; `pinned`: nodes made here are not moved out of it."""
         self.parent, self.pinned = parent, pinned
         self.owner: Loop | Guard | None = None
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.items: list[Node | Loop | Guard | Store | LoopExit] = []
-        self.seen: dict[Any, Node] = {}
+        self.seen: dict[Any, Node] = {}  # nodes made here, by operation and arguments, which equal ones reuse
 
     def free_contents(self) -> None:
-        """Empty this block and those inside, so that no number refers to itself and all are freed without a search."""
+        """Empty this block and those inside: without cycles of references all is freed at once, without a search."""
         for statement in self.items:
             if isinstance(statement, Node):
                 statement.value = None
@@ -107,10 +109,10 @@ class Buffer:
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
-        self.stores: list[Store] = []
-        self.inside: tuple[Buffer, int] | None = None
-        self.parts: list[Buffer] = []
-        self.first: list[int] = []
+        self.stores: list[Store] = []  # statements that fill it
+        self.inside: tuple[Buffer, int] | None = None  # the buffer that it is a part of, and from which entry on
+        self.parts: list[Buffer] = []  # buffers inside it
+        self.first: list[int] = []  # of each entry of a row the first that is the same number, if some are
 
     def place_buffer_inside(self, inner: "Buffer", start: int) -> None:
         """Place another buffer inside this one, from an offset on."""
@@ -119,7 +121,7 @@ class Buffer:
 
     @property
     def owner(self) -> "tuple[Buffer, int]":
-        """Return the buffer whose memory this one uses, and the offset in it."""
+        """Return the buffer whose memory this one uses, the outermost that it is `inside`, and the offset in it."""
         if self.inside is None:
             return self, 0
         whole, start = self.inside[0].owner
@@ -139,6 +141,7 @@ class Store:
     def __init__(
         self, block: Block, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]
     ):
+        """Make the statement buffer[offset + sum strides * indices] = node, of a block."""
         self.block, self.buffer, self.node, self.offset = block, buffer, node, offset
         self.strides, self.indices = tuple(strides), tuple(indices)
 
@@ -153,6 +156,10 @@ class Loop:
     __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
 
     def __init__(self, body: Block, length: int | None, initial: Sequence[Node]):
+        """Make a loop over `body` of `length` turns, None if a condition ends it; `initial`: carried numbers at first.
+
+        What a turn carries is set later: its nodes at the beginning of a turn, behind it and behind the last one.
+        """
         self.body, self.length, self.initial = body, length, list(initial)
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self
@@ -181,5 +188,5 @@ class Guard:
         self.body, self.condition = body, condition
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self
-        self.values: list[Node] = []
-        self.results: list[Node] = []
+        self.values: list[Node] = []  # nodes of the body that are used outside
+        self.results: list[Node] = []  # what stands for them there: zero where the body is skipped

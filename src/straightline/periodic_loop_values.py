@@ -45,7 +45,8 @@ class RecurringNodes(NamedTuple):
 def reuse_recurring_values(graph: Graph, outputs: Sequence[Buffer]) -> dict[Any, None]:
     """Rewrite each counted loop of one run in which many values may repeat; return what the outputs need then.
 
-    Much: S has more than DEAR operations beside the numbers that others need of it.
+    Rewritten, a loop reads the values of turns that repeat from memory. Many: the numbers that may repeat, S, have more
+    than DEAR operations beside those that others need of it, which have to be stored.
     """
     items = list_needed_items(outputs)
     for loop in [x for x in items if isinstance(x, Loop) and x.length is not None]:
@@ -102,7 +103,10 @@ def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
 
 
 def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
-    """Return which numbers of a body follow from memory that is filled before the loop and from the turn's number."""
+    """Return which numbers of a loop's body follow from memory filled before the loop and the turn's number alone.
+
+    They are those of the rows that a turn reads; no carried number is in them. `nodes` are the body's, in order.
+    """
     results, known = dict[Node, None](), {loop.counter}
     for n in nodes:
         buffer = n.value[0].owner[0] if n.op == "load" else None
@@ -115,7 +119,7 @@ def _find_nodes_of_rows(loop: Loop, nodes: Sequence[Node]) -> dict[Node, None]:
 
 
 def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, None]:
-    """Return which numbers of rows these tests are computed of, and the tests, in order."""
+    """Return which of the numbers `rows`, in order, these tests are computed of, and the tests themselves."""
     wanted = set(tests)
     for n in reversed(list(rows)):
         if n in wanted:
@@ -124,7 +128,10 @@ def _list_sources(rows: Iterable[Node], tests: Iterable[Node]) -> dict[Node, Non
 
 
 def _leave_fused_products_in_turn(needed: Iterable[Any], found: dict[Node, None]) -> None:
-    """Remove from `found` the products that are fused with a sum outside of it: apart from the sum they are rounded."""
+    """Remove from `found` the products that will be fused with a sum outside of it.
+
+    Fused, product and sum are rounded once; a product that is stored apart is rounded itself, and bits would change.
+    """
     users: defaultdict[Node, list[Any]] = defaultdict(list)
     for x in needed:
         for used in list_used_nodes(x):
@@ -234,10 +241,10 @@ def _move_to_guarded_block(
 
 
 def _choose_ring_row(graph: Graph, now: Sequence[Node], tests: RingBuffer, row: Node, period: Node) -> RingTurn:
-    """Choose a turn's row: the next of a cycle if that has the tests of now, else one for which S is computed.
+    """Choose a turn's row of the ring: the next of a cycle if that has the tests of now, else one that is computed.
 
-    now: the outcomes of the turn's tests; tests: the ring with those of each row; row: the last turn's row; period: of
-    the cycle, 0 where none is known.
+    The ring has the last turns' values, in RING rows. now: the outcomes of the turn's tests; tests: the ring with those
+    of each row; row: the last turn's row; period: of the cycle, 0 where none is known.
     """
     node, zero, one = graph.node, graph.constant(0, "i64"), graph.constant(1, "i64")
     following = node("add", "i64", row, one)
@@ -274,7 +281,7 @@ def _compare_with_start(graph: Graph, loop: Loop, carried: Sequence[int], begins
 
 
 def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
-    """Make an integer that the loop carries, `start` before the first turn; return its parameter."""
+    """Let the loop carry an integer, `start` before the first turn; return its parameter, the node of it in a turn."""
     place = loop, len(loop.parameters)
     loop.initial.append(graph.constant(start, "i64"))
     loop.parameters.append(graph.make_fresh_node("parameter", "i64", (), loop.body, place))

@@ -63,7 +63,7 @@ def lower_function(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a function of one run, for arguments of these shapes, to at most `most` operations.
+    """Return a function of one run, for arguments of these shapes, as a program of at most `most` scalar operations.
 
     known: entries of arguments, by the number of the leaf, that are the same in every call; single: whether numbers
     are float32.
@@ -107,7 +107,10 @@ def lower_traced(
 
 
 def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarray, numbers: np.ndarray) -> Value:
-    """Return an argument with constants where `mask` says that its numbers are known; a long one stays in memory."""
+    """Return an argument with constants where `mask` says that its numbers are known; a long one stays in memory.
+
+    All known, it is one known array; else each entry is a constant or a load of it, up to TABLE of them.
+    """
     if mask.all():
         return lowering.make_known_array(numbers.astype(DTYPES[view.type]))
     if view.size > TABLE:
@@ -119,7 +122,10 @@ def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarr
 
 
 def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
-    """Return the nodes, loops, guards, buffers and stores that these numbers need, in an order without chance."""
+    """Return the nodes, loops, guards, buffers and stores that these numbers need, as keys, in an order without chance.
+
+    A set would have an order that changes from process to process, and with it the program's text.
+    """
     results: dict[Any, None] = {}
     waiting: list[Any] = list(roots)
     while waiting:
@@ -139,7 +145,7 @@ def needs_arguments_alone(node: Any) -> bool:
 
 
 def _list_needs(node: Any) -> list[Any]:
-    """Return what a node, a buffer or a statement needs: arguments, memory, and the block around it."""
+    """Return what a node, a buffer or a statement needs: arguments, memory, and the loop or guard around it."""
     if isinstance(node, Buffer):
         within = [] if node.inside is None else [node.inside[0]]
         return [*node.stores, *node.parts, *within]
@@ -172,6 +178,7 @@ def _list_dependencies(node: Any) -> list[Any]:
 
 def find_fused_product(node: Node, products: set[Node]) -> Node | None:
     """Return the argument of a sum or difference that is a product fused with it (`find_fusable_products`), or None."""
+    # The value of such a product is the sum that it is fused with.
     for a in node.args:
         if a.value is node and a in products:
             return a
@@ -202,7 +209,7 @@ def find_fusable_products(items: Iterable[Any]) -> set[Node]:
 
 
 def list_used_nodes(node: Any) -> Sequence[Node]:
-    """Return the nodes that an item of a program uses directly."""
+    """Return the nodes that an item of a program (node, store, guard, loop; a buffer none) uses directly."""
     if isinstance(node, Node):
         return node.args
     if isinstance(node, Store):
@@ -215,10 +222,13 @@ def list_used_nodes(node: Any) -> Sequence[Node]:
 
 
 def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
-    """Sort items: each number after those that it is computed of, but for what a loop carries, and buffers first."""
+    """Return items sorted: each number after those that it is computed of, but for what a loop carries; buffers first.
+
+    Nodes are numbered as they are made, and so after their arguments: by these serials.
+    """
 
     def position(x: Any) -> int:
-        """Return the serial of the number after which an item stands; -1, the beginning, if it depends on none."""
+        """Return the serial (nodes are numbered as they are made) of the node behind which an item stands, or -1."""
         if isinstance(x, Store):
             return x.node.serial
         if isinstance(x, Loop | Guard):
@@ -269,8 +279,8 @@ def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[An
 def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]:
     """Return what of these items, in order, differs between runs: what varies with these inputs, and some memory more.
 
-    What runs share is computed once, before them. Of an array that a loop carries in memory the numbers of the last
-    turn are left then: where runs need those of every turn, each has an array of its own.
+    What runs share is computed once, before them. Of an array that a loop carries in memory only the numbers of the
+    last turn are left then: where runs need those of every turn, the array counts as differing, and each run has one.
     """
     differing = find_varying_items(items, inputs)
     carried = {x for x in items if isinstance(x, Buffer) and x.kind == "carried"}
@@ -283,14 +293,17 @@ def find_differing_items(items: list[Any], inputs: Iterable[Buffer]) -> set[Any]
 
 
 def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:
-    """Return the memory of which items read a part that is filled in a block inside its own."""
+    """Return the buffers of which items read a part that is filled in a block (a loop's turn) inside their own."""
     used = (n for x in items if not isinstance(x, Buffer) for n in (x, *_list_dependencies(x)) if isinstance(n, Node))
     parts = {n.value[0] for n in used if n.op == "load"}
     return {part.owner[0] for part in parts if part.block is not part.owner[0].block}
 
 
 def find_crossing_items(items: Iterable[Any], spread: set[Any]) -> set[Any]:
-    """Return which of the items are needed to compute those that differ between runs: these, and statements."""
+    """Return which items the function of what differs between runs (`spread`) has to write: these, and statements.
+
+    Statements are the stores into their memory, and the loops and guards around them.
+    """
     results = {x for x in items if x in spread or (isinstance(x, Store) and x.buffer.owner[0] in spread)}
     left = list(results)
     while left:
@@ -348,7 +361,7 @@ def row_length_of_sums(width: int, batches: int) -> int:
 
 
 def fold_rows_into_batches(sums: np.ndarray, batches: int) -> np.ndarray:
-    """Return sums (..., batch) from rows (..., `row_length_of_sums`)."""
+    """Return sums (..., batch) from rows (..., `row_length_of_sums`), whose place k is of batch k mod `batches`."""
     totals = sums[..., :batches].copy()
     for start in range(batches, sums.shape[-1], batches):
         beyond = sums[..., start : start + batches]

@@ -35,7 +35,10 @@ class _LoanedBytes:
 
 
 def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line."""
+    """Return an array whose numbers are to be filled, at an address that is a multiple of a cache line.
+
+    One of LEAST bytes or more takes memory of an earlier result that is free again, if any fits.
+    """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.empty(size + LINE, np.uint8) if size < LEAST else np.asarray(_LoanedBytes(_take_memory(size + LINE)))
     numbers: np.ndarray = align_to_cache_line(memory)[:size].view(dtype)
@@ -49,7 +52,7 @@ def align_to_cache_line(memory: np.ndarray) -> np.ndarray:
 
 
 def _take_memory(size: int) -> np.ndarray:
-    """Return at least so many bytes: those kept last, of which at most half would be idle, else fresh ones.
+    """Return at least so many bytes: the last kept ones of which at most half would be idle, else fresh ones.
 
     Other threads may take and keep memory meanwhile: what `pop` returns is this thread's.
     """
@@ -61,7 +64,7 @@ def _take_memory(size: int) -> np.ndarray:
 
 
 def _keep_memory(memory: np.ndarray) -> None:
-    """Keep bytes for later results, and give back what was kept first beyond MOST and ARRAYS."""
+    """Keep bytes for later results, and give back what was kept first beyond MOST bytes and ARRAYS pieces in all."""
     if len(memory) <= MOST:
         _kept[id(memory)] = memory
     for key in _list_surplus():
@@ -69,7 +72,7 @@ def _keep_memory(memory: np.ndarray) -> None:
 
 
 def _list_surplus() -> Iterator[int]:
-    """Return the keys of what is to be given back, so that at most MOST bytes and ARRAYS are kept."""
+    """Yield the keys of what is to be given back, the first kept first: at most MOST bytes and ARRAYS are kept."""
     kept = tuple(_kept.items())
     size, count = sum(len(memory) for _, memory in kept), len(kept)
     for key, memory in kept:

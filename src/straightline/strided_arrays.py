@@ -24,6 +24,10 @@ class StridedArray:
         offset: int = 0,
         moves: tuple[tuple[int, Node], ...] = (),
     ):
+        """Make the view whose entry (i, j, ...) is buffer[offset + strides * (i, j, ...) + sum of moves].
+
+        A move is a stride times a node, which data decide.
+        """
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
         self.loaded: tuple[Block, np.ndarray] | None = (
             None  # nodes that load it, after the block that they were made in
@@ -52,11 +56,11 @@ class StridedArray:
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "StridedArray":
-        """Return another view of the same memory, at a further offset."""
+        """Return another view of the same memory, at a further offset, and further moves (stride, node that counts)."""
         return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "StridedArray":
-        """Return entry `index` along the first axis."""
+        """Return the view of entry `index` along the first axis; one that a node says is a move of the address."""
         if isinstance(index, int) or index.op == "constant":
             known = index if isinstance(index, int) else int(index.value)
             return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
@@ -69,7 +73,11 @@ class StridedArray:
         return np.lib.stride_tricks.as_strided(table, self.shape, [s * table.itemsize for s in self.strides])
 
     def nodes(self, graph: Graph) -> np.ndarray:
-        """Return a node for each entry, which loads it: once in a block, for the blocks inside it too."""
+        """Return a node for each entry, which loads it: once in a block, for the blocks inside it too.
+
+        Raises:
+            Unsupported: an array of more than LOADED numbers.
+        """
         if self.loaded is None or self.loaded[0] not in graph.current.list_enclosing_blocks():
             if self.size > LOADED:
                 raise Unsupported(f"an array of {self.size} numbers at once")
@@ -77,7 +85,7 @@ class StridedArray:
         return self.loaded[1]
 
     def _load_entries(self, graph: Graph) -> np.ndarray:
-        """Return a node for each entry, which loads it."""
+        """Return an array of nodes, each of which loads its entry: at a known offset, moved by what nodes say."""
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
         nodes = np.empty(self.shape, dtype=object)
         for index in product(*map(range, self.shape)):
@@ -87,6 +95,7 @@ class StridedArray:
 
     def view_in_shape(self, shape: tuple[int, ...]) -> "StridedArray | None":
         """Return a view of the same numbers in another shape, None if no strides describe it."""
+        # Axes of one run of memory are merged, and those of the new shape split off again.
         if not self.size:
             return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]

@@ -26,7 +26,10 @@ class SummingProgram:
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
-        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number."""
+        """Write the code of a program; `summed`: which results are summed, and which argument is a run's number.
+
+        That argument alone differs between runs. `once` computes what all runs share, `blocks` all else.
+        """
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
         self.types = [DTYPES[b.type] for n, b in enumerate(program.inputs) if n != summed.number]
@@ -38,9 +41,10 @@ class SummingProgram:
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
 
     def measure_memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
-        """Return bytes of what is collected of `runs`, of `lanes` sums kept apart, and of the variables of all runs.
+        """Return the bytes of three: results collected run by run, sums, and variables while runs are computed.
 
-        Of those variables all runs share some; each of the blocks that are computed at once (`in_flight`) has others.
+        There are `lanes` sums kept apart, each a number for each lane and batch. Of the variables all runs share some;
+        each of the blocks that are computed at once (`in_flight`) has others.
         """
         length = row_length_of_sums(self.width, self.summed.batches)
         collected = sums = 0.0
@@ -186,9 +190,9 @@ class SummingProgramWithArguments:
         return outputs, collected
 
     def add_partial_sums(self, parts: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Return the sums (..., batch) of several sums, of each summed result that runs do not share.
+        """Return the total (..., batch) of several parts' sums, for each summed result that runs do not share.
 
-        The first of them is overwritten.
+        The first part's sums are overwritten.
         """
         return [
             fold_rows_into_batches(_add_in_order(sums), self.program.summed.batches)
@@ -201,7 +205,10 @@ class SummingProgramWithArguments:
         return [(buffer, summed and not common) for buffer, summed, common in parts]
 
     def _list_pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the addresses of inputs, tables, results and the memory that all runs share."""
+        """Return the addresses (uint64) of inputs, tables, results and the memory that all runs share, as code expects.
+
+        Among the inputs the runs' `numbers` are in the place of the argument that is a run's number.
+        """
         position = self.program.summed.number
         inputs = [*self.arguments[:position], numbers, *self.arguments[position:]]
         every = [*inputs, *self.program.code.tables, *results, self.memory]
@@ -259,7 +266,7 @@ def _count_summed_leaves(tree: Any) -> int:
 
 
 def _add_in_order(sums: Sequence[np.ndarray]) -> np.ndarray:
-    """Add arrays in order, in the memory of the first: to allocate more would take longer than to add."""
+    """Return the sum of arrays, added in order into the first: to allocate more would take longer than to add."""
     total, *others = sums
     for other in others:
         total += other

@@ -46,7 +46,7 @@ class EngineChoice(NamedTuple):
 
     @property
     def explanation(self) -> str:
-        """Sentence "native: ..." with the number of operations, or "xla: ..." with the reason."""
+        """Sentence "native: ..." with the number of operations, or "xla: ..." with `why` there is no native code."""
         if self.code is None:
             return f"xla: {self.why}"
         slow = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
@@ -76,7 +76,10 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
-    """Return why native code does not take a function of these arguments, "" if it does or if XLA is forced."""
+    """Return why native code does not take a function of these arguments, those of one run; "" if it does.
+
+    "" too where the environment forces XLA: then nothing is asked of native code.
+    """
     if read_forced_engine() == "xla":
         return ""
     with jax.enable_x64(True):
@@ -87,6 +90,8 @@ def choose_code(
     function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
 ) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
+
+    SETTING is the environment variable that forces an engine ("native" or "xla"); "" stands for none.
 
     Args:
         function: a function of the arrays of one run.
@@ -118,7 +123,7 @@ def compute_once(
         function: a function of trees of arrays.
         by_xla: the same function compiled by XLA, which computes it elsewhere.
         arguments: its arguments.
-        most: operations above which XLA computes; those that native code takes by default.
+        most: operations above which XLA computes; no limit by default, so that XLA has only what native code refuses.
     """
     with jax.enable_x64(True):
         choice = choose_code(function, arguments, [False] * len(arguments), most)
@@ -144,7 +149,10 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Compute the function by native code or XLA."""
+        """Compute the function: of known arguments by native code, if it has no more than SHORT operations.
+
+        `by_xla`, the same function compiled by XLA, takes all else; within a trace the function is traced once.
+        """
         leaves, structure = jax.tree.flatten(args)
         are_all_traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
         if are_all_traced and not kwargs:
@@ -163,8 +171,9 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
 def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> Callable[P, R]:
     """Return the function as a call within a trace, traced once for the same shapes; its operations keep their lines.
 
-    One for each structure of its arguments, so that a trace is forgotten with it: JAX keeps that as long as the
-    function. And one for all settings that what is traced depends on.
+    There is one such call for each structure of its arguments, so that a trace is forgotten with it (JAX keeps a trace
+    as long as the function), and for each state of the settings that what is traced depends on. So `structure` and
+    `settings` are only keys of the cache, which holds COMPILED calls.
     """
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -175,7 +184,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
 
 
 def read_forced_engine() -> str:
-    """Return the forced engine, "" if none is."""
+    """Return the engine that the environment variable SETTING forces, one of ENGINES; "" if it is not set."""
     engine = os.environ.get(SETTING, "")
     if engine not in ("", *ENGINES):
         raise fail(SETTING, " or ".join(ENGINES), engine)
@@ -183,7 +192,11 @@ def read_forced_engine() -> str:
 
 
 def make_native_or_none(make: Callable[[], Code]) -> Code | None:
-    """Return the native code that `make` makes, or None if XLA has to compute instead."""
+    """Return the native code that `make` makes; None if XLA has to compute, forced or since `make` raises Unsupported.
+
+    Raises:
+        ValueError: native code is forced and does not take the program.
+    """
     engine = read_forced_engine()
     if engine == "xla":
         return None
@@ -253,7 +266,10 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
     arrays = [leaf for leaf in leaves if isinstance(leaf, _ArrayOfRun)]
 
     def call(*values: Any) -> PyTree:
-        """Call the function with these values of the arrays."""
+        """Return the result of the function in the tree, with these values where `leaves` has an array's placeholder.
+
+        The tree (`structure`) is (function, *arguments): also the function may hold arrays.
+        """
         items = iter(values)
         with_values = [next(items) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
         function, *arguments = jax.tree.unflatten(structure, with_values)

@@ -62,7 +62,7 @@ def join_columns(*parts: WeightedColumns) -> WeightedColumns:
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Add covariances P_i with weights, sum_i w_i P_i; `parts` have a leading axis."""
+    """Return sum_i w_i P_i, w_i the `weights`: the columns of all P_i, (i, n, columns) in `parts`, side by side."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     return WeightedColumns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
@@ -75,6 +75,7 @@ def zero_covariance(n: int) -> WeightedColumns:
 
 def unit_lower(entries: Array) -> Any:
     """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
+    # With a 0 and a 1 behind them, each number of L is one of the entries: `place` (n, n) says which.
     xp, place = library(entries), _place_unit_lower(entries.shape[-1])
     ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
     whole = xp.concatenate([entries, ends], axis=-1)
@@ -83,8 +84,8 @@ def unit_lower(entries: Array) -> Any:
 
 @cache_arrays
 def _place_unit_lower(count: int) -> np.ndarray:
-    """Return for each number of L which of its entries it is; `count` stands for a zero, and the next for a one."""
-    n = (1 + int(np.sqrt(1 + 8 * count))) // 2
+    """Return which entry below the diagonal each number of L (n, n) is, by index; `count`: a 0, `count` + 1: a 1."""
+    n = (1 + int(np.sqrt(1 + 8 * count))) // 2  # of count = n (n - 1) / 2
     place = np.full((n, n), count)
     place[np.tril_indices(n, -1)] = np.arange(count)
     np.fill_diagonal(place, count + 1)
@@ -98,7 +99,7 @@ def below_diagonal(lower: jax.Array) -> jax.Array:
 
 
 def _take_entries(entries: jax.Array, places: np.ndarray) -> jax.Array:
-    """Take entries of the last axis at places that are known."""
+    """Return `entries[..., places]` as one operation: the places are known, and need no check of their bounds."""
     axis = entries.ndim - 1
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
     sizes = (*entries.shape[:-1], 1)
@@ -134,7 +135,8 @@ def triangularise(columns: WeightedColumns) -> WeightedColumns:
     """Find L and d with L diag(d) L' = W diag(w) W', by making the rows of W orthogonal from the first one down.
 
     d_j = |row j|^2 in the weights, L_ij = (row i, row j) / d_j, and row i loses L_ij row j. c n (n + 1) products for c
-    columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below.
+    columns, n reciprocals. A row that depends on those above it has d = 0 and adds nothing to those below. More than
+    WRITTEN rows are a loop.
 
     Source: Thornton, Triangular covariance factorizations for Kalman filtering (1976), modified weighted Gram-Schmidt.
     """
@@ -151,6 +153,7 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
         row = lax.index_in_dim(rows, j, keepdims=False)
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
+        # Column j of L: how much of row j is in each row below it, which is taken off there.
         share = column_below_diagonal(
             j, outer(lax.dot(rows, weighted), lax.reshape(reciprocal_or_one(variances[j]), (1,)))
         )
@@ -175,7 +178,7 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Rotate one column (c, w) into the factors (entries below the diagonal, d), from the first row down."""
+        """Rotate one column (c, w) into the factors (entries of L, d): of L diag(d) L' + w c c', from the first row."""
         (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
@@ -183,7 +186,7 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
             s, g = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0), weight * c[j] * reciprocal
             variances[j] = d
             for i in range(j + 1, n):
-                e = flat_place[i, j]
+                e = flat_place[i, j]  # of L_ij among the entries
                 lower[e], c[i] = s * lower[e] + g * c[i], c[i] - c[j] * lower[e]
             weight = weight * s
         return (jnp.asarray(lower, dtype), jnp.asarray(variances, dtype)), None
@@ -196,15 +199,14 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
 def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     """Factor P = L diag(d) L' by elimination: n^3 / 6 products, n reciprocals.
 
-    A pivot is known to eps of its own variance, of which rounding may leave less than nothing, as it may of a variance
-    of zero: it is at least `least` times the variance's size.
+    Rounding may leave less than nothing of a pivot d_j, so each is raised to at least `least` times |P_jj|.
     """
     pivots = least * lax.abs(diagonal(covariance))
     return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
 
 
 def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
-    """Return L and d with L diag(d) L' = P, by elimination without square roots; no d is below `least`."""
+    """Return L and d with L diag(d) L' = P, by elimination without square roots; no d_j is below `least` (n,)."""
     n, rest, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
@@ -216,7 +218,10 @@ def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> Weig
 
 
 def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
-    """Return L^-1 times rows (m, ...): of z = rows x + n with Cov n = L diag(d) L', rows of uncorrelated noises."""
+    """Return L^-1 times rows (m, ...), by substitution, of a unit lower triangular L.
+
+    Of z = rows x + n with Cov n = L diag(d) L' these are the rows of L^-1 z, of uncorrelated noises.
+    """
     solved: list[jax.Array] = []
     for i in range(len(rows)):
         known = jnp.stack(solved) if solved else jnp.zeros((0, rows.shape[1]))
@@ -226,6 +231,8 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
 def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
     """Return W (n, rank) with W W' = P of a known covariance: Cholesky's, with pivots, in units of the deviations.
+
+    The largest variance left comes first, until none is above RANK, a share of its own: less is rounding.
 
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
     """
@@ -244,7 +251,10 @@ def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
 
 
 def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Factor a known covariance: entries of L below its diagonal, and d, by the orthogonal rows of its root."""
+    """Return L's entries below the diagonal and d of a known P = L diag(d) L', by orthogonal rows of its root.
+
+    From the first row down: d_j is the square of what is left of row j.
+    """
     rows = find_covariance_root(covariance)
     n, lower, variances = len(rows), np.zeros_like(covariance), np.zeros(len(rows))
     for j in range(n):
@@ -255,7 +265,7 @@ def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def columns_of(covariance: Array) -> WeightedColumns:
-    """Return the columns of a covariance: as many as its rank where its numbers are known, else n by elimination."""
+    """Return columns W and weights w of P = W diag(w) W'; as many as the rank of a known P (NumPy's), else n."""
     if isinstance(covariance, np.ndarray):
         root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))
@@ -263,9 +273,10 @@ def columns_of(covariance: Array) -> WeightedColumns:
 
 
 def factor_covariances(covariances: Array) -> WeightedColumns:
-    """Return the columns (count, n, n) of covariances (count, n, n), one after another.
+    """Return the columns W (count, n, n) and weights w (count, n) of covariances P = W diag(w) W' (count, n, n).
 
-    Of covariances that are known they are roots, padded by columns of zeros; of others they come by elimination.
+    Of known covariances (NumPy's) they are roots of weight 1, padded by zeros where the rank is below n; of others they
+    come by elimination.
     """
     if not isinstance(covariances, np.ndarray):
         eliminated: WeightedColumns = jax.vmap(eliminate)(covariances)
@@ -331,7 +342,7 @@ def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
 
 
 def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
-    """Put L and d together from the columns below the diagonal and the entries of d."""
+    """Put L and d together from L's columns below the diagonal, which are 0 on and above it, and the entries of d."""
     n = len(variances)
     if not n:
         return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
@@ -351,7 +362,7 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
     n = len(rows)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take row j off the rows below it, and put its column of L and its entry of d in their places."""
+        """Take row j off the rows below it, orthogonal in the columns' `weights`; put column j into L, d_j into d."""
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted
@@ -365,11 +376,11 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
 
 @operation(_eliminate_column_by_column)
 def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
-    """Compute `eliminate` as a loop over the columns, natively as `_triangularise_by_loop`."""
+    """Return L and d with L diag(d) L' = P, no d below `least` (n,), as a loop over the columns: a short program."""
     n = len(covariance)
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take column j off what is left of P, and put it into L and its pivot into d."""
+        """Take column j off what is left of P, and put it into L and its pivot into d, which is at least `least[j]`."""
         rest, lower, variances = carry
         d = _bound_below(rest[j, j], least[j])
         share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)
@@ -383,6 +394,6 @@ def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColum
 def insert_column(
     j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Insert column j of L below its diagonal and entry j of d, at a place that a loop counts."""
+    """Return L with `share` in column j, below its diagonal, and `variances` with d in entry j; a loop counts j."""
     here = np.arange(len(variances)) == j
     return jnp.where(here, lower + share[:, None], lower), jnp.where(here, d, variances)

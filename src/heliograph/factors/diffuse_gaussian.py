@@ -61,7 +61,10 @@ def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
 
 
 def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the covariance of H x (m, m) by what is known, and which components hear an unknown direction (m,)."""
+    """Return the covariance of H x (m, m) by the known directions of x, and which components hear an unknown one (m,).
+
+    Unknown is a direction of infinite variance: a component that has a part of one has an infinite variance too.
+    """
     slopes = _find_slopes(matrix, x)
     unknown = jnp.any((slopes != 0) & (x.infinite > 0), axis=1)
     return (slopes * x.variances) @ slopes.T, unknown
@@ -117,8 +120,15 @@ def triangularise_both_levels(
 
 
 def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
-    """Return the law of a state of which some components (n,) are unknown, the others known by columns."""
+    """Return the law of a state of which some components are unknown: of infinite variance.
+
+    Args:
+        mean: of the state (n,).
+        known: columns and weights of the covariance of the known components.
+        unknown: which components are unknown (n,), as flags or as 0 and 1.
+    """
     n = len(mean)
+    # Unit columns with an infinite weight where unknown, then those of what is known, with finite weights.
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
     weights = FiniteAndInfiniteWeights(
         jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
@@ -129,7 +139,10 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
 
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, shift: jax.Array, noise: WeightedColumns) -> Diffuse:
-    """Predict x over x+ = F x + b + w."""
+    """Predict x over x+ = F x + b + w: F is `matrix`, b the `shift`, `noise` columns of Cov w.
+
+    Of the covariance both levels are carried on, the finite and the infinite one.
+    """
     rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
     lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + shift, below_diagonal(lower), *levels)
@@ -140,7 +153,8 @@ def _append_noise_columns(
 ) -> tuple[jax.Array, FiniteAndInfiniteWeights]:
     """Return the rows [slopes | N] of x+ = m+ + slopes xi + N omega, with the weights of their columns.
 
-    x gives the weights of xi, finite and infinite ones; those of omega are finite.
+    xi are the uncorrelated errors of x, with its variances as weights, finite or infinite ones; omega are those of the
+    noise, of finite weights. N diag(weights) N' is the noise's covariance.
     """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
     own = jnp.asarray(noise.weights)
@@ -238,9 +252,10 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
 
 
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
-    """Return the regression of x on the next state x+ = F x + b + w, of what both levels know.
+    """Return the regression of x on the next state x+ = F x + b + w, where x may have unknown directions.
 
-    What of x stays unknown given x+ has a variance that is no number, and so have the estimates that rest on it.
+    These have an infinite variance, beside the finite ones of the others: two levels. What of x stays unknown given
+    x+ gets the variance NaN, and so do the estimates that rest on it.
 
     Args:
         x: the state before the step.

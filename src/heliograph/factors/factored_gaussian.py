@@ -69,7 +69,7 @@ class Gaussian(NamedTuple):
 
     @property
     def covariance(self) -> Any:
-        """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are."""
+        """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are; the upper triangle mirrored: symmetric."""
         xp = library(self)
         root, variances = (xp.asarray(part) for part in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
@@ -84,7 +84,7 @@ def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
 
 
 def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
-    """Return the Gaussian of Cov = sum of the parts, by elimination of the summed matrix: faster, less exact."""
+    """Return the Gaussian of the summed covariances, by elimination: faster than orthogonal rows, less exact."""
     total = parts[0].covariance
     for part in parts[1:]:
         total = total + part.covariance
@@ -98,7 +98,10 @@ def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Ga
 
 
 def from_covariance(mean: Array, covariance: Array) -> Gaussian:
-    """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself."""
+    """Return the Gaussian of a covariance matrix that a user gave; each variance exact to n eps of itself.
+
+    One in NumPy is known, and factored at once; another by elimination in JAX.
+    """
     if isinstance(covariance, np.ndarray):
         factors: Any = (mean if is_traced(mean) else np.asarray(mean), *factor_known_covariance(covariance))
         return Gaussian(*factors)
@@ -107,7 +110,10 @@ def from_covariance(mean: Array, covariance: Array) -> Gaussian:
 
 
 def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumns) -> Gaussian:
-    """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w."""
+    """Predict x over x+ = F x + b + w: mean F m + b, covariance F L diag(d) (F L)' + Cov w.
+
+    x has the mean m and covariance L diag(d) L'; F is `matrix`, b the `shift`, `noise` columns of Cov w.
+    """
     return from_columns(
         jnp.asarray(matrix @ x.mean + shift), join_columns(WeightedColumns(matrix @ x.root, x.variances), noise)
     )
@@ -147,6 +153,7 @@ def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: 
 def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: WeightedColumns) -> Gaussian:
     """Return the law of (x, t) with t = mean + slopes xi + v: its factors are [[L, 0], [slopes, N]] and (d, r).
 
+    x = m + L xi, with uncorrelated xi of variances d.
     `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
     """
     root = jnp.concatenate([jnp.pad(x.root, ((0, 0), (0, len(mean)))), jnp.concatenate([slopes, noise.matrix], axis=1)])
@@ -167,8 +174,9 @@ def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
 def add_noise_to_image(image: Image, noise: WeightedColumns) -> Gaussian:
     """Return the Gaussian of f(x) + w: mean of f(x), covariance slopes diag(d) slopes' + curvature + Cov w.
 
-    `noise` holds factors of Cov w, L unit lower.
-    Slopes by orthogonal rows, as `predict_affine` does: a prior may tie what a precise measurement has to tell apart.
+    `image` has the mean, the slopes' columns (`explained`) and those of what f's curvature adds; `noise` holds factors
+    of Cov w, L unit lower. Columns are made orthogonal, not summed to a matrix: x may be so correlated that the sum
+    would round away what a precise measurement has to tell apart.
     """
     if writes_short_programs():
         factors = add_columns_to_factors(noise, image.columns)
@@ -195,11 +203,13 @@ class Innovations(NamedTuple):
         """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
         A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
-        -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation.
+        -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation. `present` (m,)
+        says what arrived, e and s are the innovations and their variances, each given those before it.
         """
         determined = self.determined
         safe = jnp.where(determined, 1.0, self.variance)
         density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
+        # It agrees up to rounding: shares of its deviation by itself (`whole` is the variance), and of the terms.
         reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
         agrees = jnp.where(lax.abs(self.value) <= reach, 0.0, -jnp.inf)
         return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
@@ -242,7 +252,10 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array
     def measure_part(
         i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Measure component i: return the rows and variances after it, and its gain."""
+        """Measure component i, of noise `weights[i]`: return the rows and variances after it, and its gain.
+
+        `root` has the components' rows below the n of the state, and so has the gain.
+        """
         return update_by_row(root, d, root[n + i], weights[i], rounding)[:3]
 
     *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
@@ -255,14 +268,16 @@ def correct_by_gain(
 ) -> Gaussian:
     """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
 
-    Joseph's form, sums of squares; with Kalman's gain it is `condition_on_observation`.
+    e is the innovation. Joseph's form, a sum of squares; with Kalman's gain it is `condition_on_observation`.
     """
     left = WeightedColumns(x.root - gain @ slopes, x.variances)
     return from_columns(x.mean + gain @ innovation, join_columns(left, noise.through(gain)))
 
 
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
-    """Change the mean and variance of t = E t + row xi, and with them x, whose law given t stays: rank one in L, d.
+    """Change the mean and variance of t = E t + row xi, a combination of x = m + L xi, and with them x, of rank one.
+
+    The law of x given t stays.
 
     The mean of t moves by `shift`, its variance V = row diag(d) row' becomes `ratio` times V, as by a likelihood of t
     of any shape: mean + K shift and P - (1 - ratio) K V K', K = Cov(x, t) / V. With f = row and
@@ -288,7 +303,8 @@ def moments_of_mixture(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
 
-    Means are taken about the first: of some so large that all are equal nothing is left, and no rounding to be squared.
+    Means are taken about the first one, so that of equal means, however large, the differences are exactly 0 and no
+    rounding is squared.
     """
     about = means - means[0]
     shift = weights @ about
@@ -372,6 +388,9 @@ def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, no
 
 def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
     """Smooth x by the smoothed next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
+
+    `later` is the smoothed law of x+, of mean m_s+ and covariance P_s+. `back` is the regression x = m + K e + noise on
+    x+ = m+ + L e; `back.left` has the noise's covariance, Cov(x given x+).
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """

@@ -15,8 +15,9 @@ from heliograph.numerics.manifold import Manifold
 def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     """Return x as it is where no state is an attitude; else the law of center plus d, from that of center + d.
 
-    The mean is settled, and errors are turned to its own axes. About m' = center plus E d an error is J (d - E d) to
-    first order, J the derivative of the change from m' there.
+    d is the change from `center`, to which a filter adds as to a plain vector; `plus` turns an attitude by d. So the
+    mean becomes m' = center plus E d, and an error about it is J (d - E d) to first order, J the derivative of the
+    change from m' at E d: errors are turned to the axes of m'.
 
     Source: Sola, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3 (the reset).
     """
@@ -29,7 +30,8 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
 def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     """Return x as it is where no state is an attitude; else the law of center + d, from that of x = center plus d.
 
-    The inverse of `settle`.
+    d is the change from `center`: `plus` turns an attitude by it, + adds it as to a plain vector, as filters need it.
+    The inverse of `settle`: its matrix J of errors is inverted.
     """
     if not manifold.rotations:
         return x

@@ -35,7 +35,10 @@ def center_gaussian(center: jax.Array, x: Gaussian) -> SplitMeanGaussian:
 
 
 def center_known(x: Gaussian) -> SplitMeanGaussian:
-    """Return a law of known numbers about its mean as single precision has it."""
+    """Return a law of known numbers with its mean split in two: as single precision has it, and the rest.
+
+    So single precision can compute with a mean of double precision; the covariance is unchanged.
+    """
     mean = np.asarray(x.mean, np.float64)
     high = mean.astype(np.float32).astype(np.float64)
     return SplitMeanGaussian(jnp.asarray(high), jnp.asarray(mean - high), x.lower, x.variances)

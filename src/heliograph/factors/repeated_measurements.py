@@ -26,10 +26,11 @@ from straightline import operation
 
 
 def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
-    """Triangularise the noises of m components, of which those that repeat others keep nothing but their own.
+    """Return L and d with L diag(d) L' = W diag(w) W', the covariance of m components' noises, by orthogonal rows.
 
-    With w_i = W_i - sum_j L_ij w_j: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is zero, where components
-    follow that might be correlated with it.
+    A component that repeats others must keep no rounding of theirs as a noise of its own. With w_i = W_i - sum_j L_ij
+    w_j, what is left of row i: an entry |w_ik| <= RANK (|W_ik| + sum_j |L_ij| |w_jk|) is put to zero, in rows that
+    have others before and behind them, so not of fewer than 3.
     """
     if len(noise.matrix) < 3:
         return triangularise(noise)
@@ -46,6 +47,7 @@ def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
 def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     """Return the variance (m,) up to which n slopes of w_i = s_i - sum_k L_ik w_k count as rounding.
 
+    s_i are the components as measured, w_i with uncorrelated noises; L is `lower`, the noises' unit triangle.
     `whole` holds the variances (m,) of the rows s_i. It is ROUNDING_UNITS n eps of each s_i, from which measuring takes
     what was known, and RANK of what is subtracted: a correlation of noises is not known to more.
     """
@@ -98,7 +100,8 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
     def eliminate_row(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take row j, its rounding set to 0, off the rows below it; put column j into L and its variance into d.
 
-        Carried are what is left of the rows of A, the `size` of each entry with all that was taken off it, L and d.
+        L diag(d) L' = A diag(weights) A'. Carried are what is left of the m rows of A, the `size` of each entry (its
+        absolute value plus all that was taken off it), L and d. An entry up to `share` of its size is rounding.
         """
         rows, size, lower, variances = carry
         row = _set_rounding_to_zero(rows[j], share * size[j])

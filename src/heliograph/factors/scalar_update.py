@@ -18,6 +18,7 @@ def update_by_scalar(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Update the rows V of a root and its variances d by one scalar measurement f' xi + v; return V, d, gain K and s.
 
+    x = m + V xi, with uncorrelated xi of variances d (n,).
     With Var v = r, s = f' diag(d) f + r is the variance of the innovation, and K = V diag(d) f / s.
 
     With s_j = r + sum_{k >= j} f_k^2 d_k and w_j = sum_{k >= j} d_k f_k V_k, columns V_j of V:
@@ -33,8 +34,13 @@ def update_by_scalar(
 def update_by_scalar_given_products(
     root: jax.Array, d: jax.Array, f: jax.Array, products: tuple[jax.Array, jax.Array], noise: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `update_by_scalar`, given diag(d) f and f_j^2 d_j: both are zero of what says nothing."""
+    """Measure f' xi + v of x = V xi, given `products`: d_j f_j and f_j^2 d_j, which are 0 of a slope that is rounding.
+
+    Returns the rows V and variances d given the measurement, its gain K = V diag(d) f / s, and the variance s of its
+    innovation. `noise` is Var v.
+    """
     product, power = products
+    # s_j = Var v + sum_{k >= j} f_k^2 d_k, down to the variance of the noise alone; s_0 is that of the innovation.
     s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
     after, kept, w = update_root_columns(root, d, product, f, s)
     return after, kept, w * reciprocal_or_one(s[0]), s[0]
@@ -83,7 +89,10 @@ def update_by_parts(
     if n > WRITTEN:
 
         def measure_next(i: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            """Measure part i, and put its gain into column i of the gains."""
+            """Measure part i of a vector of n, and put its gain into column i of the gains.
+
+            `least` is the variance up to which a part's slopes are rounding; row `first_part` of the root is part 0's.
+            """
             root, d, least, gains = carry
             root, d, gain = measure_part(i, root, d, least[i])
             gains = jnp.where(np.arange(n) == i, gain[:, None], gains)
@@ -110,9 +119,10 @@ def propagate_slope_rounding(least: jax.Array, gain: jax.Array, measured: jax.Ar
 def update_by_row(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array, least: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Measure f' xi + v as `update_by_scalar` does; slopes of a variance up to `least` are rounding and say nothing.
+    """Measure f' xi + v of x = V xi, Cov xi = diag(d); return V, d, the gain and the variance of the innovation.
 
-    They are measured with a noise beside which they are nothing to the last digit.
+    Slopes f whose variance f' diag(d) f is at most `least` are rounding and must say nothing: such a measurement is
+    taken with a noise so large that it changes no digit. None: there are none to judge. `noise` is Var v.
     """
     product = d * f
     power = f * product
@@ -129,12 +139,15 @@ Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def update_by_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array) -> Measured:
-    """Measure the rows below the n of a state, one by one: rows, variances, news, innovations and their variances.
+    """Measure the rows below the n of a state, one by one; return what each has changed.
+
+    These are rows (n + m, n) and variances (n,) given the measurements, `news`, the m innovations, each given those
+    before it, and their variances.
 
     Args:
         root: rows (n + m, n) of L, and of the m components' slopes below.
         d: variances (n,) of the columns.
-        news: mean, and less the innovations (n + m,).
+        news: the mean, and below it the innovations times -1, since a gain moves both by the same sum (n + m,).
         variance: of the components' noises (m,).
         least: variance (m,) up to which slopes are rounding.
     """
@@ -145,7 +158,11 @@ def update_by_rows(root: jax.Array, d: jax.Array, news: jax.Array, variance: jax
 def _update_by_rows_one_by_one(
     root: jax.Array, d: jax.Array, news: jax.Array, variance: jax.Array, least: jax.Array
 ) -> Measured:
-    """Write `update_by_rows` out, row after row."""
+    """Write `update_by_rows` out, row after row: the m rows of `root` below the n of the state are measured.
+
+    `news` is the mean and, below it, the innovations times -1; `least` the variance up to which a row's slopes count as
+    rounding, which none does of the first, whose slopes nothing was taken off.
+    """
     n, values, totals = len(d), list[jax.Array](), list[jax.Array]()
     for i in range(len(variance)):
         root, d, gain, total = update_by_row(root, d, root[n + i], variance[i], least[i] if i else None)
@@ -167,7 +184,11 @@ def _update_by_rows_in_loop(
     n = len(d)
 
     def measure_next(carry: Carried, noise: jax.Array) -> tuple[Carried, tuple[jax.Array, jax.Array]]:
-        """Measure the row of this noise; return what is next, and its innovation with the variance."""
+        """Measure row n of the root, behind the state's n rows; return what is next, and (innovation, its variance).
+
+        Then row n is moved behind all others, so that the next row to measure takes its place. `news` holds the mean
+        and the innovations times -1, `least` the variance up to which slopes are rounding.
+        """
         root, d, news, least = carry
         rows, d, gain, variance_of_row = update_by_row(root, d, root[n], noise, least[0])
         innovation = -news[n]

@@ -29,7 +29,8 @@ def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarra
 def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
     """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
 
-    Of a matrix that rounding made indefinite, those of the nearest covariance: what is below zero counts as zero.
+    So units do not matter. Where rounding made an eigenvalue negative, it counts as zero; a component of variance zero
+    (`known` is False in its row and column) has a row of zeros.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     unit = np.where(deviation > 0, deviation, 1.0)
@@ -85,6 +86,7 @@ def observe_root(
 def _solve_for_gain(v: np.ndarray, k_v: np.ndarray, independent: np.ndarray) -> np.ndarray:
     """Return K (..., n, m) from the lower triangular V (..., m, m) and K V, with zeros for dependent components.
 
+    A dependent one repeats others, so that its pivot V_jj is rounding; `independent` (..., m) says which are not.
     By substitution from the last column on: K_j = (K V_j - sum_i>j K_i V_ij) / V_jj.
     """
     pivots = np.diagonal(v, axis1=-2, axis2=-1)
@@ -101,14 +103,19 @@ def observe_information(
 ) -> ObservedRoot:
     """Condition x of covariance W W' on measurements of information J = C' Cov(v)^-1 C: P+ = (P^-1 + J)^-1.
 
-    With J = U U' they say as much as U' x + v, Cov v = I; P may be singular.
+    P = W W' may be singular, so it is not inverted: with J = U U', z = U' x + v with Cov v = I says as much. Returns
+    the gain of that z, and a root of P+.
     """
     rows = roots_of(information).swapaxes(-1, -2)
     return observe_root(root, rows, np.eye(rows.shape[-1]))
 
 
 def _find_independent_rows(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.ndarray, "*items m"]:
-    """Find which rows have more than RANK of their square left beside those before them that have, by Gram-Schmidt."""
+    """Find which rows are independent of the independent rows before them, by Gram-Schmidt.
+
+    These are the rows (..., m, c) of whose squared length more than the share RANK is left, when their part along those
+    before is taken off.
+    """
     rest, adds = rows, np.zeros(rows.shape[:-1], bool)
     for j in range(rows.shape[-2]):
         square = np.sum(rest[..., j, :] ** 2, axis=-1)

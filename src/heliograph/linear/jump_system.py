@@ -24,7 +24,10 @@ Maps = Callable[[Any], Any]  # of several symmetric matrices at once, along a fi
 
 
 def mix_moments_of_modes(chain: Float[Array, "*time M M"], moments: Float[Array, "*axes _ n n"]) -> Any:
-    """Return Y_j = sum_i T_ij X_i."""
+    """Return Y_j = sum_i T_ij X_i, for each next mode j, of moments X_i by mode i and the chain's probabilities T_ij.
+
+    Moments that are not kept by mode have one X, for which a row of T is enough: each next mode's share of it.
+    """
     *axes, modes, n, _ = moments.shape
     sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
     return sums.reshape(*axes, -1, n, n)
@@ -62,7 +65,7 @@ class JumpSystem(NamedTuple):
         return propagate_by_mode(self.maps, mix_moments_of_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
-        """Propagate X from before the first step: X after each step."""
+        """Return the moments X by mode after each step, propagated from those before the first one (M, n, n)."""
         steps = []
         for fields in zip(*self, strict=True):
             moments = JumpSystem(*fields).step(moments)
@@ -76,7 +79,10 @@ class JumpSystem(NamedTuple):
         return (1 if np.all(self.chain[0] == self.chain[0][:1]) else modes, n, n)
 
     def operator(self) -> Float[np.ndarray, "e e"]:
-        """Return the matrix of X -> X over all steps, without noise, on the entries of upper triangles."""
+        """Return the matrix that takes X before the first step to X after the last, without noise.
+
+        It acts on the e entries of the upper triangles of all modes' moments X.
+        """
         return np.asarray(
             make_matrix_on_triangle_entries(self._replace(added=0.0 * self.added)._propagate_one_period, self.shape)
         )
@@ -86,7 +92,10 @@ class JumpSystem(NamedTuple):
         return spectral_radius(self.operator())
 
     def steady(self) -> Any:
-        """Solve for X (time, M, n, n) after each of steps that repeat for ever, of a radius below 1."""
+        """Return the steady moments X (time, M, n, n) by mode after each of the steps, which repeat for ever.
+
+        The spectral radius of their operator has to be below 1; else there are none.
+        """
         # X after a period is a linear map of X before it, and what comes from no X: both are equal where it is steady.
         start = solve_fixed_point(
             self._replace(added=0.0 * self.added)._propagate_one_period,
@@ -106,7 +115,8 @@ class JumpSystem(NamedTuple):
         def go_back(later: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
             """Return the derivative by X before the first step, and L of each step, with these weights W.
 
-            `later` is the derivative by X after the last step, through what follows it.
+            `later` is the derivative by X after the last step, through what follows it. Each step, taken backwards,
+            applies the transposes of its maps F_j and of its chain.
             """
             derivatives = []
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
@@ -131,14 +141,20 @@ class JumpSystem(NamedTuple):
 
 
 def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Float[Array, "e e"]:
-    """Return the matrix of a linear map of symmetric matrices (..., n, n) on the entries of their upper triangles."""
+    """Return the matrix of a linear map of symmetric matrices (..., n, n) on the e entries of their upper triangles.
+
+    Column k holds what the map makes of the k-th unit matrix: an entry and its mirror image at 1, all else at 0.
+    """
     _, where, basis = _place_in_upper_triangles(shape)
     matrix: Array = linear(basis)[:, *where].T
     return matrix
 
 
 def solve_fixed_point(linear: Maps, constant: Array) -> Any:
-    """Solve X = L(X) + C for a linear map of symmetric matrices (..., n, n), and a constant of their shape."""
+    """Solve X = L(X) + C for a linear map L of symmetric matrices (..., n, n), and a constant C of their shape.
+
+    As linear equations for the entries of the upper triangles, which are all that a symmetric matrix has.
+    """
     matrix, where = (
         make_matrix_on_triangle_entries(linear, constant.shape),
         _place_in_upper_triangles(constant.shape)[1],
@@ -156,9 +172,10 @@ def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) 
 def _place_in_upper_triangles(
     shape: tuple[int, ...],
 ) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
-    """Return each matrix entry's place among those of the upper triangles, where these are, and unit matrices of each.
+    """Return how symmetric matrices of a shape (..., n, n) are made of the entries of their upper triangles.
 
-    A unit matrix has one of these entries, and its mirror image, at 1 and all else at zero.
+    Three results: for each entry of the matrix its place in the list of these entries; their indices in the matrix; and
+    for each a unit matrix, with this entry and its mirror image at 1 and all else at 0.
     """
     where = np.nonzero(np.triu(np.ones(shape)))
     mirrored = *where[:-2], where[-1], where[-2]

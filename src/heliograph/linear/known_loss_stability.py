@@ -46,8 +46,11 @@ class KnownLossSystem(NamedTuple):
     def close_loop(self, gains: KindGains, noise: float = 1.0) -> JumpSystem:
         """Return the recursion of V: V_j+ = F_j U_j F_j' + law_j (K R_j K' + Q), F_j = A - K C, true of any gains.
 
+        V_j is the error covariance times the flag of mode j, on average, U its mixture by the chain. `gains` has one K
+        for each kind of mode; Q and R are scaled by `noise`.
+
         Raises:
-            ValueError: more entries than the limit.
+            ValueError: more than SIZE_LIMIT entries in all V_j; one V serves where each step draws its mode anew.
         """
         n, modes = len(self.transition), len(self.chain)
         size = n * n * (1 if np.all(self.chain == self.chain[0]) else modes)
@@ -64,10 +67,11 @@ class KnownLossSystem(NamedTuple):
 
 
 def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
-    """Return the spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
+    """Return the spectral radius of the step from error covariances V to V+ under any gains, wherever they come from.
 
-    Below 1, E P stays bounded under these gains, hence under the best. The witness is V > 0 with V - V+ > 0 without
-    noise, checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
+    Below 1, the mean error covariance E P stays bounded under these gains, hence under the best. That is checked: a map
+    that keeps covariances has a radius below 1 exactly where there is a witness, a V > 0 with V - V+ > 0 without noise.
+    Where the one that is tried, the steady V of unit noises, fails by multiplication, infinity is returned.
 
     Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
     """
@@ -153,7 +157,11 @@ def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vec
 
 
 def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
-    """Return the best gain of each kind for these covariances V by mode, with R and law scaled by `noise`."""
+    """Return the best gain of each kind of mode s for these covariances V by mode, with R scaled by `noise`.
+
+    K_s = A U C_s' (C_s U C_s' + R)^-1: U (V mixed by the chain) and R (noises, weighted by the modes' law) are summed
+    over the modes that the receiver cannot distinguish from each other, those with `known` = s.
+    """
     results: list[np.ndarray] = []
     before: Parts = mix_moments_of_modes(system.chain, parts)
     for s, c in enumerate(system.outputs):
@@ -165,7 +173,10 @@ def _improve_gains(system: KnownLossSystem, parts: Parts, noise: float) -> KindG
 
 
 def _relative_change(before: KindGains, after: KindGains) -> float:
-    """Return the largest change of an entry of the gains, relative to the largest entry after it."""
+    """Return the largest change of an entry of the gains of all kinds, relative to the largest entry of those `after`.
+
+    0 if these are all zero.
+    """
     size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
     gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
     return float(gap / size) if size > 0 else 0.0
@@ -189,7 +200,10 @@ class UnobservedGrowth(NamedTuple):
 
 
 def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
-    """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
+    """Return each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d).
+
+    SAME, relative to the matrix's norm, is the distance up to which eigenvalues are one, and singular values zero.
+    """
     results: list[tuple[complex, np.ndarray]] = []
     size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
     for value in np.linalg.eigvals(matrix):
@@ -203,8 +217,9 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
 def find_fastest_unobserved_mode(
     matrix: Float[np.ndarray, "n n"], chain: Float[np.ndarray, "modes modes"], outputs: Sequence[np.ndarray]
 ) -> UnobservedGrowth:
-    """Find the largest growth over eigenvalues and sets of modes that do not observe them.
+    """Find the largest growth of E P a step, over eigenvalues a and sets of modes that do not observe them.
 
+    It is |a|^2 times the spectral radius of the chain within the set, which says how long the links stay there:
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
     """
     results = [
@@ -219,7 +234,13 @@ def find_fastest_unobserved_mode(
 def _find_unobserving_modes(
     space: np.ndarray, outputs: Sequence[np.ndarray]
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
-    """List sets of modes that all miss a common eigenvector, largest for each subspace, with a basis of these."""
+    """List sets of modes whose outputs all miss a common eigenvector, each with a basis of these eigenvectors.
+
+    Args:
+        space: a basis of all eigenvectors of one eigenvalue (n, d).
+        outputs: the matrix C of each mode.
+    """
+    # Subspaces by the largest set of modes that misses them: the whole space, and its cuts with what outputs miss.
     subspaces = {frozenset(_list_modes_not_observing(space, outputs)): space}
     for output in outputs:
         for known in list(subspaces.values()):
@@ -235,7 +256,10 @@ def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) 
 
 
 def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Return the part of a subspace that the rows of an output do not observe, each row taken at its own size."""
+    """Return a basis of the part of a subspace that the rows of an output do not observe; `space` is a basis (n, d).
+
+    Rows are divided by their lengths, since units must not matter: a part below UNSEEN of a row is not observed.
+    """
     sizes = np.linalg.norm(output, axis=1)
     rows = output[sizes > 0] / sizes[sizes > 0][:, None]
     if not len(rows):

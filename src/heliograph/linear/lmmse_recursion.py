@@ -50,7 +50,9 @@ class CarriedRounding(NamedTuple):
     def after_step(self, system: LinearSystem, k: int, matrices: Steps, gains: Gains) -> "CarriedRounding":
         """Return F X F' + (I - G C) D (I - G C)' + G R G' of the rounding X before, with that of Cov(w) and Cov(v).
 
-        An error D in Cov(w) adds as much to the error's covariance; a gain that minimises has no part in it.
+        D and R are here the rounding of these (diagonal), G the gain, F = (I - G C) A. An error D in Cov(w) adds as
+        much to the error's covariance; that it changes the gain, too, adds nothing, since the gain minimises. The
+        largest share of a claimed variance so far is noted with its step k.
         """
         keep = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
@@ -71,18 +73,19 @@ def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoo
 
 
 def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Return a root of a noise covariance, beside that of the rounding of what the noise is added to.
+    """Return a root W of a noise covariance plus that of rounding, W W' = Cov + rounding: their columns side by side.
 
-    `seconds` are the second moments of the numbers it is added to.
+    `seconds` are the second moments of the numbers that the noise is added to: their sum is what is rounded.
     """
     rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
 def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
-    """Return P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, on roots.
+    """Return the gain G and roots of P- and P, given a root of P before: one step of Kalman's recursion.
 
-    O may be singular (products of a measurement with few values repeat): what repeats has the gain zero.
+    P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-. O may be singular (products of a
+    measurement with few values repeat): what repeats has the gain zero. `noises` are roots of Cov(w) and Cov(v).
     """
     predicted = np.concatenate([matrices.transition @ root, noises.process], axis=1)
     gain, after = observe_root(predicted, matrices.output, noises.received)
@@ -152,6 +155,7 @@ def _make_gains(system: LinearSystem, matrices: Steps, covariances: RecursionSte
 def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
     """Return whether a covariance and its rounding are steady, to STILL of each entry's own scale.
 
+    `before` are the two as they were SPAN steps ago. An entry's scale is the product of its two deviations.
     A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
     and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
     """
@@ -169,7 +173,11 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
 
 
 def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
-    """Lower the claim where rounding is more than a small part (`lost`) of a claimed variance."""
+    """Return the claim (what a covariance is worth), lowered to "nominal" where rounding spoils it, with a warning.
+
+    `lost` is the largest share that rounding has of a claimed variance, which may be up to DIGITS_TOLERANCE; `step` is
+    where.
+    """
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
     if lost > DIGITS_TOLERANCE:
         warnings.warn(

@@ -81,10 +81,10 @@ def modal_system(
 
 
 def _find_state_size(move: Channel, measure: Channel) -> int:
-    """Return n of a move from n to n numbers and a measurement of n numbers.
+    """Return n, the number of states, of a `move` from n to n numbers and a measurement of n numbers, both checked.
 
     Raises:
-        ValueError: maps of other sizes, or gains in `move` that drift.
+        ValueError: maps of other sizes, or gains in `move` that drift (Gaussian ones, instead of chains of modes).
     """
     for what, affine in (("move", move), ("measure", measure)):
         check_maps(what, [first(affine)])

@@ -38,7 +38,7 @@ Moments = Float[np.ndarray, " monomials"]  # of (x, 1), all of one order
 
 
 def check_finite_moments(moments: Moments, k: int, order: int) -> None:
-    """Raise ValueError where moments of the state after step k are no finite numbers."""
+    """Raise ValueError where moments of the state after step k, up to degree `order`, are no finite numbers."""
     if not np.all(np.isfinite(moments)):
         got = f"ones beyond doubles at step {k + 1}: use a shorter horizon, or units in which the state is smaller"
         raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
@@ -53,17 +53,18 @@ class SteadyMomentTest:
 
     def __init__(self, matrix: Float[np.ndarray, "n n"], order: int, varies: bool):
         rate = 1 - spectral_radius(matrix)
-        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate
+        self._tolerance = -1.0 if varies or rate <= 0 else EPS * rate  # negative: moments never come to rest
         n, places = len(matrix), position(len(matrix) + 1, order)
-        self._powers = np.array(list_exponents(n + 1, order))[:, :n]
+        self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
         self._squares = [places[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
         self._last: Moments | None = None
 
     def is_steady(self, moments: Moments) -> bool:
-        """Return whether the moments are those of the call before, to rounding."""
+        """Return whether the moments are those of the call before, to rounding; False if the tolerance is negative."""
         before, self._last = self._last, moments
         if before is None or self._tolerance < 0:
             return False
+        # Of each moment the size that its variables' squares give it: prod_i (E x_i^2)^(power_i / 2).
         scale = np.prod(np.sqrt(np.abs(moments[self._squares])) ** self._powers, axis=1)
         return bool(np.all(np.abs(moments - before) <= self._tolerance * scale))
 
@@ -134,7 +135,7 @@ def _compute_noise_and_next_law(
     moved: Float[np.ndarray, "L L"],
     second: Float[Array, "L L"],
 ) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, " modes"]]:
-    """Return Cov(w) of a step of Y 1{mode}, N = modes L, and the law of the modes after it.
+    """Return Cov(w) of a step of the N = modes x L products of Y and the modes' flags, and the modes' law after it.
 
     Args:
         law: of the modes before the step, p.
@@ -153,9 +154,9 @@ def _compute_noise_and_next_law(
 def _average_noise(
     law: Float[np.ndarray, " modes"], lifts: "Sequence[LiftedMap]", moments: Moments
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
-    """Return the mean noise over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal.
+    """Return the mean noise covariance over the modes, sum_j p_j E[Cov(Z | y, j)], and the rounding of its diagonal.
 
-    `law` holds the modes' probabilities p_j, `lifts` each mode's map to Z, `moments` those of y.
+    `law` holds the modes' probabilities p_j, `lifts` each mode's map to monomials Z of z, `moments` those of y.
     """
     spreads, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
     return np.tensordot(law, spreads, axes=1), np.abs(law) @ np.array(losses)
@@ -164,7 +165,7 @@ def _average_noise(
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Return the law of the modes after a step; the law before where it differs by rounding only."""
+    """Return the law of the modes after a step; the one before where it differs by rounding only: then it is steady."""
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -223,12 +224,12 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 def _lift_chain(
     routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
 ) -> LinearSystem:
-    """Lift the steps of a channel with memory: to monomials times the indicator of each joint mode (`lift_modes`).
+    """Return the system of monomials times the flag of each mode, of a channel with memory (`lift_modes`).
 
     `moments` are those of x_0 up to twice the degree, `sizes` the numbers of states and of outputs.
     """
     n, m = sizes
-    distinct = {id(r.measurement): r.measurement for r in routes}
+    distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), max(len(modes.initial) for modes in modes_by_id.values()))
     projection = np.pad(
@@ -311,7 +312,8 @@ class LiftedMap:
         self.highest[~known[:, None] & ~known] = 2 * degree
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
-        """Return E[mono(z)] from E[mono(y)], both of twice the degree."""
+        """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
+        # `whole` is the matrix between them; None if it was too large to be kept.
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             if self.whole is not None:
                 return np.asarray(self.whole @ np.asarray(moments))
@@ -346,7 +348,7 @@ def mean_and_spread(
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
     """Return the mean and covariance of y, given the second moments of (y, 1).
 
-    The diagonal is raised by n + 2 units of rounding of what is subtracted, so that the covariance stays one.
+    The diagonal is raised by n + 2 times EPS of the second moments: subtracting must not make a variance negative.
     """
     second = np.asarray(second)
     mean = second[:-1, -1]
@@ -357,12 +359,13 @@ def mean_and_spread(
 def split_homogeneous(
     homogeneous: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m-1 n-1"], Float[np.ndarray, "m-1"]]:
-    """Return the matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
+    """Return the matrix A and the offset a of a homogeneous matrix [[A, a], [0, 1]], of y -> A y + a."""
     return homogeneous[:-1, :-1], homogeneous[:-1, -1]
 
 
 def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
+    # Of exponents of (variables, 1): variable i itself has the power 1, and the constant the rest of the degree.
     places = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(places) - 1))
     for i, row in enumerate(rows):
@@ -371,8 +374,9 @@ def make_linear_rows(variables: int, degree: int, expected: int | None = None) -
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """Return E[monomials of (x_0, 1)] of this order, under the plant's law of x_0."""
+    """Return E[monomials of (x_0, 1)] of this order, under the plant's law of x_0: Gaussian unless it has another."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
+    # x_0 = (initial mean - the law's mean) + a draw of the law, as a homogeneous matrix.
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
     return np.asarray(push_through_known_map(shift, order, noise_moment_vector(law, order)))

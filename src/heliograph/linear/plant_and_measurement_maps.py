@@ -44,7 +44,10 @@ def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
 def make_plant_and_measurement_maps(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int
 ) -> list[PlantAndMeasurementMaps]:
-    """Return the maps of each step, with the noises' moments up to `order` computed once for what does not vary."""
+    """Return the plant's and the measurement's random map of each step; steps that do not vary share one object.
+
+    Of noises the moments up to `order` are tabulated, once for steps that share them.
+    """
     plants = _convert_to_affine_maps(list_checked_steps(plant, horizon), order)
     sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
@@ -57,7 +60,11 @@ def make_plant_and_measurement_maps(
 def _make_measurement_maps(
     sensors: Sequence[AnySensor], channels: Sequence[AbstractRandomAffine], order: int
 ) -> list[AbstractRandomAffine]:
-    """Return the maps from the state to z; a sum of links whose sensors' noises are independent is one of x itself."""
+    """Return the random map from the state to what is received, z, at each step.
+
+    It is the sensor's map followed by the channel's; but where the outputs of a sum of links have independent noises,
+    the sensor is moved into each link (`move_sensor_into_links`), which makes one map of the state itself.
+    """
     apart = list[AbstractRandomAffine]()
     for sensor, channel in zip(sensors, channels, strict=True):
         assert isinstance(sensor, LinearSensor)  # checked before
@@ -71,7 +78,8 @@ def _make_measurement_maps(
 def _convert_to_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """Return the map x -> A x + noise of each plant or sensor, with the noise's moments tabulated up to `order`.
 
-    `check_model` has seen that all are linear. A model like the one before shares its map and table.
+    `check_model` has seen that all are linear, with A in `matrix`. A step whose model is the same object as the one
+    before shares its map, and one of an equal noise its table. GainAndNoise has the random gain 1 times A.
     """
     maps: list[GainAndNoise] = []
     before, noise = None, TabulatedNoise(models[0].noise, order)
@@ -87,7 +95,7 @@ def _convert_to_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAn
 
 
 def list_checked_steps(model: T | OverTime, horizon: int) -> list[T]:
-    """Return a plant, sensor or channel at each of `horizon` steps."""
+    """Return a plant, sensor or channel at each of `horizon` steps, which one that varies over time must cover."""
     check_horizon(horizon)
     check_horizon(horizon, steps_covered(model))
     return list_models_by_step(model, horizon)

@@ -97,7 +97,10 @@ def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "
 
 
 def _make_filter_map(g: Gains) -> np.ndarray:
-    """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter."""
+    """Return the homogeneous matrix of (x+, q, z+) -> (x+, F q + K z+ + c, z+), one step of the linear filter.
+
+    q (n,) is its estimate, z+ (m,) the measurement; `g` has F (transition), K (gain) and c (offset).
+    """
     n, m = g.gain.shape
     after = np.eye(2 * n + m)
     after[n : 2 * n, n : 2 * n], after[n : 2 * n, 2 * n :] = g.transition, g.gain
@@ -115,7 +118,10 @@ class _MomentCache:
         self.moments: tuple[np.ndarray, np.ndarray] = np.zeros((0, 0)), np.zeros((0, 0))
 
     def make_move_map(self, plant: GainAndNoise, m: int) -> GainAndNoise:
-        """Return the map (x, q, z) -> (x+, q) of a plant's step, q being n numbers and z m."""
+        """Return the map (x, q, z) -> (x+, q) of a plant's step, x and q being n numbers and z, which is dropped, m.
+
+        The noise of (x+, q), none of it on q, is kept as long as the plant's is the same object.
+        """
         n = plant.inputs
         if self.joint_noise is None or plant.noise is not self.noise:
             no_noise = Gaussian(np.zeros((n, n)))
@@ -125,7 +131,10 @@ class _MomentCache:
         return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
     def make_measurement_moments(self, route: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q)."""
+        """Return the matrices by which (x+, q, z+) has its moments of order 2 and 4 from those of (x+, q).
+
+        `route` is the random map from x+, the first n of these 2 n numbers, to z+. Matrices of the last one are kept.
+        """
         if route is not self.route:
             appended = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
             self.route = route
@@ -134,7 +143,10 @@ class _MomentCache:
 
 
 def _make_received_products(n: int, m: int) -> np.ndarray:
-    """Return the rows that read (monomials of z up to degree 2, z_i q_j) off all products of (x, q, z)."""
+    """Return rows, each with one 1, that read z, z z' and z q' off all monomials up to degree 2 of (x, q, z).
+
+    x and q have n numbers, z has m. A product is found by its exponents, of (x, q, z, 1).
+    """
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
     expected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
@@ -258,8 +270,8 @@ def _largest_third_moment(
 ) -> float:
     """Return the largest |k3(a, b, c)| / (sd a sd b sd c) over c, of numbers with this joint covariance and mean.
 
-    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c). `pair` are the places of a b, a and b, `linear` those of
-    each c.
+    k3(a, b, c) = Cov(a b, c) - E a Cov(b, c) - E b Cov(a, c), the third central moment; sd is a standard deviation.
+    `pair` are the places of the product a b, of a and of b among the N numbers, `linear` those of each c.
     """
     product, a, b = pair
     deviation = np.sqrt(np.diag(joint))
@@ -270,7 +282,10 @@ def _largest_third_moment(
 
 
 def _place_products(variables: int) -> dict[tuple[int, ...], int]:
-    """Return the positions of y_i and of y_i y_j among the monomials of degree 2."""
+    """Return the positions of y_i, by (i,), and of y_i y_j, by (i, j), i <= j, among the monomials up to degree 2.
+
+    Monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
+    """
     index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)
     places: dict[tuple[int, ...], int] = {

@@ -63,7 +63,11 @@ def critical_arrival(
     no_outputs = np.zeros((0, len(a)))  # C of a lost packet
 
     def certified_gain(arrival: float) -> Float[np.ndarray, "n m"] | None:
-        """Return a gain that is certified to keep the error bounded at this probability of arrival, or None."""
+        """Return a gain that is certified to keep the error bounded at this probability of arrival, or None.
+
+        a, q, c, r: the plant's A and Cov(w), the sensor's C and Cov(v). `fixed` is a gain that was given, which alone
+        is tried; certified is one under which the radius of the error covariance's step is below 1.
+        """
         # Independent losses as a chain of two modes with equal rows: mode 0 arrived, mode 1 lost, of no outputs.
         chain = np.array([[arrival, 1 - arrival]] * 2)
         system = KnownLossSystem(
@@ -93,7 +97,11 @@ def critical_arrival(
 
 
 def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
-    """Find the smallest arrival probability with a certified gain, by bisection, and that gain."""
+    """Find the smallest probability of arrival with a certified gain, by bisection, and that gain.
+
+    `gain_at` gives one for a probability, None where none is certified; with probability 1 there is one. `lower` is a
+    bound below which there is none: where one is certified just above it, it is the answer.
+    """
     near, gain = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
     if near is not None:
         return lower, near
@@ -107,7 +115,10 @@ def _bisect_critical_arrival(gain_at: Callable[[float], np.ndarray | None], lowe
 
 
 def plant_matrices(plant: AnyPlant, what: str = "plant") -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """Return A and Cov(w) of a constant linear plant, for `what` needs them."""
+    """Return A (n, n) and Cov(w) (n, n) of a constant linear plant; refuse any other plant, and states that are angles.
+
+    `what` names in the error who needs such a plant.
+    """
     if (
         not isinstance(plant, LinearPlant)
         or not isinstance(plant.noise, AbstractNoise)
@@ -121,7 +132,10 @@ def plant_matrices(plant: AnyPlant, what: str = "plant") -> tuple[Float[np.ndarr
 def sensor_matrices(
     sensor: AnySensor, states: int, what: str = "sensor"
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m m"]]:
-    """Return C and Cov(v) of a constant linear sensor of so many states, for `what` needs them."""
+    """Return C (m, n) and Cov(v) (m, m) of a constant linear sensor of n states; refuse any other, and angles.
+
+    `what` names in the error who needs such a sensor.
+    """
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail(what, "a LinearSensor that does not vary", _describe_type(sensor))
     check_sensor(sensor, states)
@@ -130,7 +144,7 @@ def sensor_matrices(
 
 
 def _describe_type(model: AnyPlant | AnySensor) -> str:
-    """Name the type of a model for an error message, with how it varies."""
+    """Return the type of a model in words for an error message: by what it varies, else its class."""
     if isinstance(model, OverTime):
         return "one that varies"
     return f"one that varies with {list(model.inputs)}" if isinstance(model, LinearPlant) else type(model).__name__

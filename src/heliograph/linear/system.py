@@ -103,8 +103,8 @@ class LinearSystem(Module):
 
     @property
     def steady_from(self) -> int:
-        """The first step from which on all steps are as the last."""
-        changes = [0]
+        """The first step from which on all steps are as the last, in matrices and roundings; 0 if none differs."""
+        changes = [0]  # of each field, the last step that differs from the one before
         for field in (*self.steps, self.rounding, self.received_rounding):
             moved = field[1:] != field[:-1]
             changed = np.flatnonzero(np.any(moved, axis=tuple(range(1, moved.ndim))))
@@ -132,9 +132,9 @@ class StateMoments(NamedTuple):
 
 
 def state_moments(system: LinearSystem) -> StateMoments:
-    """Propagate the moments of y of a `system` before any data: X+ = A X A' + Cov(w).
+    """Return mean and covariance X_k of y before any data, at the start and after each step: X+ = A X A' + Cov(w).
 
-    No best filter's error exceeds them, P_k <= X_k.
+    The error covariance P_k of the best filter does not exceed it, P_k <= X_k, since data do not harm it.
 
     Args:
         system: a linear system.
@@ -242,7 +242,7 @@ class Schedule(Module):
 
 
 def _array_or_nan(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of the given shape, NaN where it is not known."""
+    """Return a value as an array of the given shape, checked; NaN, where it is not known, is kept."""
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)
     return np.where(unknown, np.nan, checked)
@@ -252,7 +252,7 @@ def load_schedule(path: str | Path) -> Schedule:
     """Read the schedule that `Schedule.save` wrote to the file `path`.
 
     Args:
-        path: of the file.
+        path: of the file (.npz), with an array for each field of Gains, the start and the claim.
 
     Raises:
         ValueError: a file that holds no schedule.

@@ -2,7 +2,10 @@
 
 
 def __getattr__(name: str) -> object:
-    """Load a name that other folders take; nothing is imported before, as in `heliograph` itself."""
+    """Load a name that other folders take; nothing is imported before, as in `heliograph` itself.
+
+    Called of the first such name only: then the functions of `lazy_names` take this one's place.
+    """
     from heliograph.numerics.lazy_exports import lazy_names
 
     here = globals()

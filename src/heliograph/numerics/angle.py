@@ -47,7 +47,7 @@ def wrap_near(value: A, reference: Array, angles: Angles) -> A:
     if not angles:
         return value
     xp = library(value, reference)
-    turns = xp.round((value - reference) / TURN)
+    turns = xp.round((value - reference) / TURN)  # TURN: 2 pi
     chosen = np.isin(np.arange(np.shape(value)[-1]), angles) & ~xp.isnan(turns)
     unwrapped: A = xp.where(chosen, value - TURN * turns, value)
     return unwrapped
@@ -65,7 +65,7 @@ def continue_angles(
 
     f(x) is taken near f(center) + D (x - center), where D is the Jacobian of resulting angles by given angles, rounded
     to whole turns. So an angle that follows a given one makes any number of turns with it, and every other angle is
-    taken within half a turn of its value at the center.
+    taken within half a turn of its value at the center. `given` are the places of angles in x, `angles` those in f(x).
     """
     if not angles:
         return function

@@ -53,13 +53,13 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
 def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
     """Return the function with what it makes of an object shared by all who ask, as long as one of them holds it.
 
-    What is made must hold the object, whose identity is the key.
+    What is made must hold the object, whose identity is the key: so the identity is not given to another meanwhile.
     """
     in_use: WeakValueDictionary[int, T] = WeakValueDictionary()
 
     @wraps(make, updated=())
     def share_or_make(source: S) -> T:
-        """Return what was made of this object and is still in use, else make it."""
+        """Return what was made of this object and is still in use (somebody holds it), else make it."""
         made = in_use.get(id(source))
         if made is None:
             made = in_use[id(source)] = make(source)
@@ -69,10 +69,11 @@ def share_by_object(make: Callable[[S], T]) -> Callable[[S], T]:
 
 
 def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function of arguments to be hashed with its results cached, copied at each call.
+    """Return a function of hashable arguments with its results, NumPy arrays, cached, and copied at each call.
 
-    JAX converts a NumPy array that a trace closes over to the precision of that trace once for all traces: after one in
-    single precision the same array is single in a double one, or an index of another type than the length it meets.
+    Without the copy, JAX converts an array that a trace closes over to the precision of that trace once for all traces:
+    after one in single precision the same array is single in a double one, or an index of another type than the length
+    it meets.
     """
     known = cast(Callable[P, T], cache(function))
 

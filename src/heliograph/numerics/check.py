@@ -34,14 +34,14 @@ class DomainReportingArray(np.ndarray):
 
 
 def mark_checked(value: object, report: Callable[[str, Domain], None]) -> DomainReportingArray:
-    """Return a copy of an array that calls `report(name, domain)` when it is checked."""
+    """Return a copy of an array that calls `report(name, domain)`, the numbers it may hold, when it is checked."""
     copy = np.array(value, dtype=np.float64).view(DomainReportingArray)
     copy.report = report
     return copy
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
-    """Tell a marked array the domain that is required of it: `whole`, or `entry` of marked entries in a list."""
+    """Tell an array marked by `mark_checked` what numbers it may hold: `whole`, or `entry` of an entry of a list."""
     if isinstance(value, DomainReportingArray):
         if value.report is not None:
             value.report(name, whole)
@@ -52,7 +52,7 @@ def report_domain(name: str, value: object, whole: Domain, entry: Domain | None 
 
 
 def report_covariance(name: str, value: object) -> None:
-    """Tell a marked array that it is a covariance or a variance; in a list of rows, entries on the diagonal."""
+    """Tell an array marked by `mark_checked` that it is a covariance or variance; in rows, one on the diagonal."""
     if isinstance(value, DomainReportingArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):
@@ -84,7 +84,7 @@ def show_value(value: object) -> str:
 
 
 def error_text(error: Exception) -> str:
-    """Return an error of a user's function as a short part of one line; where JAX cannot trace, what to write."""
+    """Return an error of a user's function in 120 characters at most; where JAX cannot trace it, what to write."""
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return "one that decides by a value: write jnp.where"
     for raised in (error, error.__cause__):
@@ -171,7 +171,7 @@ def _read_numbers(name: str, value: ArrayLike) -> Any:
 
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
-    """Return `value` as a finite scalar between `low` and `high`; True and False are none."""
+    """Return `value` as a finite scalar from `low` to `high`, which a traced one may exceed; no True or False."""
     if isinstance(value, bool | np.bool_):
         raise fail(name, _describe_range(low, high), show_value(value))
     report_domain(name, value, Domain(low=low, high=high))
@@ -183,13 +183,13 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 
 def _describe_range(low: float, high: float) -> str:
     """Return in words which numbers lie between two limits."""
-    if 0 < low <= TINY:
+    if 0 < low <= TINY:  # the least positive double: a bound that says no more than "positive"
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
     return f"a number of at least {low:g}" if high == np.inf else f"a number from {low:g} to {high:g}"
 
 
 def items(name: str, value: object, what: str) -> list[Any]:
-    """Return the items of a list, a tuple or another iterable; text, dictionaries and sets are refused."""
+    """Return the items of a list, a tuple or another iterable, or raise; so of text, dictionaries and sets."""
     try:
         if isinstance(value, str | bytes | Mapping | AbstractSet):
             raise TypeError
@@ -199,14 +199,14 @@ def items(name: str, value: object, what: str) -> list[Any]:
 
 
 def table(name: str, value: object, what: str) -> dict[str, Any]:
-    """Return a copy of a dictionary whose keys are names."""
+    """Return a copy of a dictionary whose keys are names, or raise: expected a dictionary of `what`."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise fail(name, f"a dictionary of {what} by name", show_value(value))
     return dict(value)
 
 
 def spread_over_names(name: str, value: T | Mapping[str, T], names: Sequence[str], whom: str = "node") -> list[T]:
-    """Return one value for each name, from a value for all of them or a dictionary of just these names."""
+    """Return one value for each of `names`, from a value for all of them or a dictionary with just these keys."""
     if not isinstance(value, Mapping):
         return [value] * len(names)
     if set(value) != set(names):
@@ -215,7 +215,7 @@ def spread_over_names(name: str, value: T | Mapping[str, T], names: Sequence[str
 
 
 def instance(name: str, value: object, kind: type[T], what: str) -> T:
-    """Return an object of a class."""
+    """Return a value that is an object of class `kind`, or raise: expected `what`."""
     if not isinstance(value, kind):
         raise fail(name, what, show_value(value))
     return value
@@ -242,7 +242,7 @@ def file_path(name: str, value: object) -> Path:
 
 
 def rank(name: str, value: object) -> int:
-    """Return the number of axes of what may become an array."""
+    """Return the number of axes of what may become an array, or raise."""
     try:
         return np.ndim(cast(ArrayLike, value))
     except (TypeError, ValueError, OverflowError):  # rows of different lengths, a set of arrays, a key
@@ -273,7 +273,7 @@ def is_whole(value: object) -> TypeGuard[int | np.integer]:
 
 
 def check_count(name: str, value: object, least: int = 1) -> int:
-    """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
+    """Return a whole number from `least` to MOST (2^32 - 1): an int or one of NumPy's, no float and no bool."""
     if not is_whole(value) or value < least:
         expected = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
         raise fail(name, expected, value if isinstance(value, int | float) else show_value(value))
@@ -283,14 +283,14 @@ def check_count(name: str, value: object, least: int = 1) -> int:
 
 
 def check_seed(name: str, value: object) -> int:
-    """Return a whole number that 32 bits hold, as the keys of draws do."""
+    """Return a whole number from 0 to MOST, 2^32 - 1, or raise: keys of draws are made of 32 bits of it."""
     if not is_whole(value) or not 0 <= value <= MOST:
         raise fail(name, f"a whole number from 0 to {MOST}", show_value(value))
     return int(value)
 
 
 def check_horizon(value: object, covered: int | None = None) -> int:
-    """Return a number of steps, no more than what varies over time covers."""
+    """Return a number of steps, no more than the `covered` ones that something varying has; None: nothing varies."""
     horizon = check_count("horizon", value)
     if covered is not None and horizon > covered:
         raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
@@ -344,7 +344,7 @@ def standard_deviations(matrix: np.ndarray) -> np.ndarray:
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
-    """Return non-negative numbers that sum to one."""
+    """Return non-negative numbers (count,) that sum to one, to PROBABILITY_TOLERANCE, or raise; traced ones unasked."""
     report_domain(name, value, SIMPLEX, PROBABILITY)
     chances = array(name, value, (count,))
     if is_traced(chances):
@@ -359,8 +359,8 @@ def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
 def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     """Return the radius of each uncertain probability; a scalar is the same radius for each.
 
-    A radius above max(p, 1 - p) is refused: no probability could ever move that far. Which corners a radius leaves is
-    read off the numbers, so that neither it nor, where it is positive, the probabilities can be traced.
+    A radius, by which p may be wrong, above max(p, 1 - p) is refused: p could not move so far. The extremes that it
+    leaves are read off the numbers, so that neither it nor, where it is positive, p (`nominal`) can be traced.
     """
     numbers = _read_numbers(name, value)
     if is_traced(numbers):
@@ -377,7 +377,7 @@ def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
 
 
 def name_list(name: str, value: Names) -> list[str]:
-    """Return names as a list, none of them blank; of a mapping, each with its unit."""
+    """Return names as a list, none of them blank; of a mapping (name to unit) its keys, each marked with its unit."""
     listed: list[str]
     if isinstance(value, Mapping):
         listed = [NameWithUnit(str(key), text(f"{name}, unit of {key!r}", unit)) for key, unit in value.items()]
@@ -389,7 +389,7 @@ def name_list(name: str, value: Names) -> list[str]:
 
 
 def names(name: str, value: Names | None, count: int, prefix: str) -> tuple[str, ...]:
-    """Return `count` distinct names; None gives prefix0, prefix1, ...; a mapping gives each name its unit."""
+    """Return `count` distinct names; of None prefix0, prefix1, ...; of a mapping (name to unit) its keys with units."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
     distinct = tuple(name_list(name, value))

@@ -31,7 +31,7 @@ class Compensated(NamedTuple):
 
 
 def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
-    """Return fl(a + b) and its rounding error, whichever is larger.
+    """Return fl(a + b), the rounded sum, and its rounding error a + b - fl(a + b), whichever of a and b is larger.
 
     Source: Knuth, The art of computer programming, volume 2, theorem B of section 4.2.2.
     """
@@ -41,10 +41,10 @@ def split_sum(a: jax.Array, b: jax.Array) -> Compensated:
 
 
 def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Callable[[Compensated], Compensated]:
-    """Return x -> f(high + low), compensated, of a JAX function f of one array.
+    """Return x -> f(high + low) of a JAX function f of one array, compensated: its low part is what rounding loses.
 
-    Loops hand on what was lost before them, and their own roundings stay. Where a low part is no number,
-    as behind the derivative of a root at 0, there is none.
+    Loops hand on what was lost before them, and their own roundings stay. Where a low part is no number, as behind the
+    derivative of a root at 0, it is 0.
 
     Args:
         function: f, of operations with derivatives.
@@ -52,7 +52,10 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
     """
 
     def evaluate(x: Compensated) -> Compensated:
-        """Return f(high + low) as high + low, 0 where the low part is no number."""
+        """Return f(high + low) as high + low, with low 0 where it is no number, or where nothing was lost (None).
+
+        f is `function`, evaluated operation by operation, in a precision of rounding `unit`.
+        """
         program = jax.make_jaxpr(function)(x.high)
         result = _CompensatedEvaluation(unit).evaluate_program(program, [x])[0]
         low = jnp.zeros_like(result.high) if result.low is None else result.low
@@ -75,7 +78,7 @@ class _CompensatedEvaluation:
         }  # fmt: skip
 
     def evaluate_program(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
-        """Return the results of a traced program."""
+        """Return the results of a traced program, each with what rounding lost, operation by operation."""
         jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
         values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
@@ -90,7 +93,7 @@ class _CompensatedEvaluation:
         return list(map(look_up, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
-        """Split a known real number into what the precision holds of it and the rest."""
+        """Split a known real number into what the precision holds of it and the rest; others have no rest (None)."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
         whole = np.asarray(number, np.float64)
@@ -99,7 +102,10 @@ class _CompensatedEvaluation:
         return Compensated(high, rest if np.any(rest) else None)
 
     def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
-        """Return the results of one operation; of one without a rule f(high) + f'(high) rest."""
+        """Return the results of one operation f; of one without a rule in `rules`, f(high) + f'(high) low.
+
+        A call of a program and a branch are evaluated inside.
+        """
         name, params = equation.primitive.name, equation.params
         if (program := called_program(equation)) is not None:
             return self.evaluate_program(program, inputs)
@@ -113,7 +119,7 @@ class _CompensatedEvaluation:
         """Take one of several programs, each evaluated so."""
 
         def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
-            """Return its results, each with a low part if it is a real number, as those of the others."""
+            """Return its results; each real one gets a low part, be it 0, as all branches need the same structure."""
             results = self.evaluate_program(branch, given)
             real = [jnp.issubdtype(jnp.result_type(x.high), jnp.floating) for x in results]
             return [
@@ -142,7 +148,10 @@ class _CompensatedEvaluation:
         return Compensated(a.high * b.high, _sum_terms_present(self._find_product_error(a.high, b.high), *lost))
 
     def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
-        """Divide: the remainder a - q b, and what was lost of it, over b."""
+        """Return q = fl(a / b) and its low part: the remainder a - q b, with the low parts of a and b, over b.
+
+        The product q b, too, is rounded: `back` is fl(q b), and its error is taken off.
+        """
         quotient = a.high / b.high
         back = quotient * b.high
         lost = None if b.low is None else -quotient * b.low
@@ -150,7 +159,7 @@ class _CompensatedEvaluation:
         return Compensated(quotient, rest / b.high)
 
     def _take_root(self, a: Compensated, **_: Any) -> Compensated:
-        """Take a root: the remainder a - r^2, and what was lost of a, over 2 r."""
+        """Return r = fl(sqrt(a)) and its low part: the remainder a - r^2, with the low part of a, over 2 r."""
         root = jnp.sqrt(a.high)
         rest = _sum_terms_present((a.high - root * root) - _or_zero(self._find_product_error(root, root)), a.low)
         return Compensated(root, rest / (2 * root))
@@ -160,20 +169,20 @@ class _CompensatedEvaluation:
         return self._multiply(a, a)
 
     def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
-        """Return a^y as y products; its reciprocal for y < 0, 1 for y = 0."""
+        """Return a^y as y - 1 products; the reciprocal of a^-y for y < 0, 1 for y = 0."""
         if y < 1:
             return self._divide(Compensated(np.ones(())), self._raise_to_integer(a, y=-y)) if y else _one_like(a)
         return reduce(self._multiply, [a] * y)
 
     def _sum(self, a: Compensated, axes: tuple[int, ...], **_: Any) -> Compensated:
-        """Add the entries along axes, one after another."""
+        """Add the entries along axes, one after another, with what rounding loses; of no entries the sum is 0."""
         for axis in sorted(axes, reverse=True):
             parts = _split_along_axis(a, axis)
             a = reduce(self._add, parts) if parts else Compensated(jnp.sum(a.high, axis=axis))
         return a
 
     def _sum_running(self, a: Compensated, axis: int, reverse: bool) -> Compensated:
-        """Return the running sums along an axis, from its first entry on or from its last."""
+        """Return the running sums along an axis, from its first entry on or from its last, with what rounding loses."""
         parts = _split_along_axis(a, axis)
         if reverse:
             for i in reversed(range(len(parts) - 1)):
@@ -203,14 +212,19 @@ class _CompensatedEvaluation:
         return Compensated(*(None if part is None else jnp.reshape(part, shape) for part in total))
 
     def _find_product_error(self, a: Any, b: Any) -> Any:
-        """Return a b - fl(a b) of numbers whose halves have exact products; None where one is 0 or a power of two."""
+        """Return a b - fl(a b), the rounding error of a product; None where it is exact: one is 0 or a power of two.
+
+        The halves of the numbers' digits have exact products, so only fl(a b) is rounded.
+        """
         if _scales_without_rounding(a) or _scales_without_rounding(b):
             return None
         (a1, a2), (b1, b2) = self._split_digits_in_halves(a), self._split_digits_in_halves(b)
         return ((a1 * b1 - a * b) + a1 * b2 + a2 * b1) + a2 * b2
 
     def _split_digits_in_halves(self, a: Any) -> tuple[Any, Any]:
-        """Return a as a sum of two numbers of half as many digits.
+        """Return a as a sum of two numbers of half as many digits: far - (far - a), far = splitter a, and the rest.
+
+        Known numbers are split by NumPy in the precision of the program, and kept in double.
 
         Source: Dekker, A floating-point technique for extending the available precision (1971).
         """
@@ -245,7 +259,7 @@ def _apply_to_first_order(
     with_low = [i for i, x in enumerate(inputs) if x.low is not None]
 
     def call_with(*replaced: Any) -> Any:
-        """Return f with these values in the places of the inputs that have a low part."""
+        """Return f (`function`) of the high parts, with these values for the inputs that have a low part."""
         arguments = [x.high for x in inputs]
         for i, value in zip(with_low, replaced, strict=True):
             arguments[i] = value
@@ -270,14 +284,18 @@ def _apply_to_first_order(
 
 
 def _scales_without_rounding(a: Any) -> bool:
-    """Return whether a known number multiplies without rounding: each entry is 0 or a power of two."""
+    """Return whether a known number multiplies without rounding: each entry is 0 or a power of two.
+
+    Of JAX's numbers, which may not be known yet, False is returned.
+    """
     if isinstance(a, jax.Array | jax.core.Tracer):
         return False
+    # frexp's mantissa is from 0.5 to 1, and 0.5 of a power of two.
     return bool(np.all((np.abs(np.frexp(a)[0]) == 0.5) | (np.asarray(a) == 0)))
 
 
 def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
-    """Return the entries along an axis."""
+    """Return the entries along an axis, each with its low part, or None if there is none of the whole."""
     count = jnp.shape(a.high)[axis]
     parts = [[None] * count if x is None else [_take(x, i, axis) for i in range(count)] for x in a]
     return [Compensated(high, low) for high, low in zip(*parts, strict=True)]
@@ -289,9 +307,10 @@ def _take(x: Any, i: int, axis: int) -> Any:
 
 
 def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int], left: bool) -> Compensated:
-    """Arrange the left factor as (batch, summed, rows, 1), or the right one as (batch, summed, 1, columns).
+    """Arrange a factor of a matrix product so that the product is their entrywise product, summed over axis 1.
 
-    `batch` and `summed` are its axes of these kinds; of each kind the axes become one.
+    The left factor becomes (batch, summed, rows, 1), the right one (batch, summed, 1, columns). `batch` and `summed`
+    are its axes of these kinds; of each kind the axes become one.
     """
     shape = jnp.shape(a.high)
     rest = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]

@@ -25,7 +25,9 @@ class Share(NamedTuple):
 
 
 def wilson(hits: float, of: float) -> Share:
-    """Return k / n with Wilson's interval, |k - n p| <= 1.96 sqrt(n p (1 - p)) for its ends p; (NaN, 0, 1) of nothing.
+    """Return the share of `hits` k among n (`of`), with Wilson's interval of 95 %; (NaN, 0, 1) of nothing.
+
+    It holds the p with |k - n p| <= 1.96 sqrt(n p (1 - p)).
 
     Source: Wilson, Probable inference (1927).
     """
@@ -41,9 +43,9 @@ def wilson(hits: float, of: float) -> Share:
 
 
 def count_independent(values: Float[np.ndarray, " time"]) -> float:
-    """Return how many independent values say as much: N (1 - a) / (1 + a), a the correlation of neighbours.
+    """Return how many independent values say as much of the mean: N (1 - a) / (1 + a), a the correlation of neighbours.
 
-    A negative correlation counts as none, so that it is never more than N.
+    A negative correlation counts as none, so that it is never more than N; nor is it less than 1.
     """
     deviations = values - np.mean(values)
     power = float(np.sum(deviations**2))
@@ -68,8 +70,8 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 def round_to(value: float, error: float) -> str:
-    """Return a number to two digits of its standard error, to four digits without one."""
+    """Return a number as text to two digits of its standard error, to four digits where there is no error above 0."""
     if not (np.isfinite(value) and 0 < error < np.inf):
         return f"{value:.4g}"
-    places = 1 - int(np.floor(np.log10(error)))
+    places = 1 - int(np.floor(np.log10(error)))  # behind the point; negative: tens, hundreds
     return f"{value:.4g}" if not -6 <= places <= 9 else f"{round(value, places):.{max(places, 0)}f}"

@@ -19,7 +19,10 @@ _first: list[int] = []  # the process in which something was computed first; a f
 
 
 def refuse_forked_process() -> None:
-    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process."""
+    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process.
+
+    `_first` holds the id of the first process that came here: a fork inherits it, and JAX's threads it does not.
+    """
     here = os.getpid()
     if not _first:
         _first.append(here)
@@ -81,9 +84,10 @@ def in_haste() -> Options:
 
 @cache
 def understood() -> Options:
-    """Return those of the options that this release of the compiler knows: they are not part of its promises.
+    """Return those of OPTIONS for XLA, the compiler, that this release knows; it does not promise to keep them.
 
-    The optimisation level is left out where JAX's flag jax_disable_most_optimizations is set, which it would overrule.
+    LEVEL, the optimisation level, is left out where JAX's flag jax_disable_most_optimizations is set, which it would
+    overrule.
     """
     has_no_level = jax.config.values["jax_disable_most_optimizations"]
     names = [name for name in OPTIONS if not (has_no_level and name == LEVEL)]
@@ -91,7 +95,7 @@ def understood() -> Options:
 
 
 def _is_understood(name: str) -> bool:
-    """Return whether this version of XLA knows an option."""
+    """Return whether this version of XLA knows one of OPTIONS, tried by compiling a trivial program with it."""
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options={name: OPTIONS[name]})()
     except jax.errors.JaxRuntimeError:
@@ -100,10 +104,10 @@ def _is_understood(name: str) -> bool:
 
 
 def to_numpy(tree: PyTree) -> PyTree:
-    """Turn every concrete numeric JAX array of a pytree into a NumPy array; leave keys and traced values alone."""
+    """Return a tree with its known numeric JAX arrays as NumPy arrays; keys and traced values stay as they are."""
 
     def convert(leaf: object) -> object:
-        """Return one leaf, a known array of numbers as NumPy's."""
+        """Return one leaf: a known array of numbers as NumPy's, anything else (a traced one, random keys) as it is."""
         if isinstance(leaf, jax.core.Tracer) or not isinstance(leaf, jax.Array):
             return leaf
         return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.extended) else np.asarray(leaf)
@@ -112,7 +116,7 @@ def to_numpy(tree: PyTree) -> PyTree:
 
 
 def in_float64(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function in the float64 scope and hand NumPy arrays back.
+    """Return the function, run in double precision (JAX's float64 scope), with NumPy arrays as its results.
 
     Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan (which may
     have chosen single precision).
@@ -123,7 +127,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Call the function in the float64 scope; inside a trace as it is."""
+        """Call the function in double precision (JAX's float64 scope), for NumPy arrays; inside a trace as it is."""
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         refuse_forked_process()
@@ -155,11 +159,14 @@ def let_compute_in_float64(kind: type, names: Sequence[str]) -> None:
 
 
 def _compute_known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function, computed at once and in float64 where no argument is traced, also inside of a trace."""
+    """Return the function, computed at once and in double precision where no argument is traced.
+
+    Also inside of a trace: what is known is then a number in it, not operations in the trace's precision.
+    """
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Call the function in the float64 scope where no number is traced."""
+        """Call the function in double precision, at once, where no number is traced, even within a trace."""
         is_in_float64 = jax.dtypes.canonicalize_dtype(float).itemsize == 8
         if is_in_float64 or is_traced((args, kwargs)):
             return function(*args, **kwargs)
@@ -173,13 +180,14 @@ def _compute_known_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function once per structure and shapes of its arguments, run it in float64, hand NumPy arrays back.
 
-    Numbers in the arguments become arrays first, so that a step counter does not compile anew at each step. Inside a
-    trace it is the plain function.
+    Numbers in the arguments become arrays first, so that a step counter, which would be a constant of the program, does
+    not compile anew at each step. Inside a trace it is the plain function.
     """
     jitted = quickly_compiled(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the compiled function in double precision, for NumPy arrays; inside a trace the plain function."""
         if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         refuse_forked_process()
@@ -193,6 +201,6 @@ def compile_in_float64(function: Callable[P, R]) -> Callable[P, R]:
 def as_array(leaf: object) -> object:
     """Return a number as an array, which compiled code takes as an argument; anything else as it is."""
     value = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
-    if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":
+    if isinstance(value, np.ndarray) and value.dtype.kind in "OUS":  # objects (so large integers) and texts
         raise fail("argument", "numbers that a double can hold", show_value(leaf))
     return value

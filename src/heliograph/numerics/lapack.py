@@ -14,19 +14,20 @@ A = TypeVar("A", jax.Array, np.ndarray)
 
 
 def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
-    """Return the eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
+    """Return the eigenvalues and eigenvectors (columns) of a symmetric matrix; of a batch one after another.
 
-    A batch at once is dealt out to the processor's threads by a call that waits for them on one of them: programs that
-    run side by side on as many threads then wait for each other for ever.
+    JAX deals a batch out to the processor's threads by a call that waits for them on one of them: programs that run
+    side by side on as many threads then wait for each other for ever.
     """
     values, vectors = _eigh(a)
     return values, vectors
 
 
 def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
-    """Return A^+ B for a positive semidefinite A, by its correlation matrix, so that units do not matter; NumPy or JAX.
+    """Return A^+ B, A^+ the pseudoinverse of a positive semidefinite A, by its correlation matrix; NumPy or JAX.
 
-    Directions with an eigenvalue below `tolerance` of the largest are skipped, as are rows of zeros.
+    So units do not matter. Directions in which the correlations' eigenvalue is below `tolerance` of the largest are
+    skipped, as are rows of zeros.
     """
     xp = library(a, b)
     deviation = xp.sqrt(xp.maximum(xp.diagonal(a), 0.0))

@@ -21,11 +21,14 @@ MEANT = {  # what others call it, in plain letters
 
 
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub lists its public names."""
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub (.pyi) lists its public names.
+
+    A name's module is imported when the name is first asked for.
+    """
     load, listed, names = lazy_loader.attach_stub(package, file)
 
     def attribute(name: str) -> object:
-        """Return a public name, loaded; raise with the names most like it where there is none."""
+        """Return the object of a public name, imported; raise with the names most like it where there is none."""
         if name in names or name.startswith("_"):
             with pause_collector():
                 return load(name)
@@ -35,9 +38,10 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
 
 
 def refuse_attribute(owner: object, name: str, remedies: Mapping[str, str] | None = None) -> NoReturn:
-    """Refuse an attribute that an object does not have, with what to write instead, or the names most like it.
+    """Raise AttributeError for a name that an object does not have, with what to write instead.
 
-    What stands in `remedies`, by name, comes first, then a function of heliograph that has the name.
+    That is what stands in `remedies` under the name; else the attributes most like it; else the function of heliograph
+    of this name.
     """
     kind = type(owner)
     if name.startswith("_") or hasattr(kind, name):  # private to others, or a property with an error in it
@@ -58,7 +62,11 @@ def suggest_names(name: str, known: Mapping[str, str]) -> str:
 
 
 def list_closest_names(name: str, known: Mapping[str, str]) -> list[str]:
-    """Return what stands for the known names most like a name, the nearest first; capitals and _ count for nothing."""
+    """Return the values of the `known` names most like a name, MOST at most; capitals and _ count for nothing.
+
+    First the one that others call so (MEANT), then those alike by their letters (ALIKE is the least likeness of
+    difflib's), then those that contain it.
+    """
     plain: dict[str, str] = {}
     for public, shown in known.items():
         plain.setdefault(_strip_name(public), shown)
@@ -76,7 +84,10 @@ def _strip_name(name: str) -> str:
 
 
 def _list_public(package: str, names: list[str]) -> dict[str, str]:
-    """Return the package's names as they are written after it; of heliograph itself also those of its rooms."""
+    """Return public names that a user may have meant, each with how it is written: the package's `names` first.
+
+    Of heliograph itself (no dot) also those of its rooms (subpackages), as room.name; of a room those of heliograph.
+    """
     known = {name: name for name in names}
     if "." in package:
         known |= {name: f"heliograph.{name}" for name in import_module("heliograph").__all__ if name not in known}

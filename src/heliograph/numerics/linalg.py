@@ -64,7 +64,8 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return lower L with A = L L' of a positive semidefinite A, and the reciprocals of its diagonal, (n, n) and (n,).
 
     Column by column: the first column of what is left of A, times the reciprocal root of its pivot; of a zero column
-    that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular.
+    that is 0. A pivot is judged by the component's own diagonal entry: units do not decide what is singular. More than
+    WRITTEN columns are a loop, so that the program stays short.
     """
     n, left, columns, scales = len(a), a, list[jax.Array](), list[jax.Array]()
     if not 0 < n <= WRITTEN:
@@ -85,7 +86,11 @@ def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     n, whole = len(a), diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """Take column j of the factor off what is left of the matrix, and put it in its place."""
+        """Take column j of the factor off what is left of the matrix, and put it and its scale in their places.
+
+        `whole` is the matrix's diagonal, by which a pivot is judged, a scale the reciprocal root of a pivot, and
+        `growth` the largest ratio so far of an entry of `whole` to its pivot.
+        """
         left, lower, scales, growth = carry
         scale = compute_pivot_reciprocal_root(left[j, j], whole[j], growth)
         column = jnp.where(np.arange(n) >= j, left[:, j] * scale, 0.0)
@@ -103,8 +108,8 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
     """Return 1 / root of a pivot; 0 of one that is zero up to rounding of the `whole` entry, NaN of a negative one.
 
     `whole` is the diagonal entry of the matrix, of which the pivot is left. `growth` is the largest ratio of a diagonal
-    entry to its pivot before; dividing by such a pivot multiplies by it what rounding makes of this one. The root is
-    taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
+    entry to its pivot before; dividing by such a pivot multiplies by it what rounding makes of this one, and so how far
+    below zero this one may be by rounding. The root is taken of infinity where nothing is left: of derivative 0.
     """
     is_zero_or_more = pivot >= -negative_tolerance(pivot, growth) * whole
     if_not_positive = jnp.where(is_zero_or_more, jnp.inf, jnp.nan)
@@ -141,11 +146,11 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array
 
 
 def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
-    """Return `psd_solve` of one A for several B, one after another: it is factored once."""
+    """Return the function B -> X of A X = B for one positive semidefinite A, which is factored once for many B."""
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:
-        """Return X of A X = B, A = L L'."""
+        """Return X of A X = B, A = L L'; `scales` are the reciprocals of L's diagonal, 0 for a pivot of zero."""
         # L Y = B, then L' X = Y. L' is upper; with its rows and columns in reverse order it is lower, as Y and X then
         # are upside down.
         y = _substitute(lower, scales, jnp.asarray(b)) * scales[:, None]
@@ -159,7 +164,7 @@ def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
 def _substitute(lower: jax.Array, scales: jax.Array, b: jax.Array) -> jax.Array:
     """Return the numerators B_i - sum_{j < i} L_ij Y_j of L Y = B (n, k): each row of Y is taken off those below it.
 
-    Y_i is numerator i times `scales`, the reciprocals of L's diagonal.
+    Y_i is numerator i times `scales`, the reciprocals of L's diagonal (n,). Above WRITTEN rows it is a loop.
     """
     n, left, numerators = len(b), b, list[jax.Array]()
 
@@ -188,9 +193,11 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
 def squared_distance_terms(
     a: jax.Array, x: jax.Array, size: Array | float = 0.0, roundings: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the terms of `squared_distance`, each given those before it, and which of them these determine.
+    """Return the terms (n,) of x' A^-1 x, each of a component given those before it, and which of them these determine.
 
-    A component whose standard deviation is no more than `roundings` roundings of its `size` counts as determined.
+    A is x's covariance. A determined component counts 1 where it agrees with those before it, infinity where not. One
+    whose standard deviation is no more than `roundings` roundings of its `size` (of the numbers whose difference x is)
+    counts as determined, too.
     """
     variance = diagonal(a)
     agreement = OFF_SUPPORT * jnp.sqrt(jnp.maximum(variance, 0.0)) + OFF_VALUE * jnp.abs(size)  # see squared_distance
@@ -211,10 +218,10 @@ def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def find_not_finite(values: np.ndarray, axes: int) -> np.ndarray:
-    """Return which arrays of the last `axes` axes have a number that is not finite.
+    """Return which arrays, along the last `axes` axes, have a number that is not finite: flags by the other axes.
 
-    The sum of all is one too then, and takes a third of the time: only if it is not finite, by which it may also have
-    overflowed, is each number looked at.
+    Then the sum of all is not finite either, which takes a third of the time to see. Each number is looked at only if
+    it is not, since the sum may also have overflowed.
     """
     with np.errstate(all="ignore"):
         if np.isfinite(np.sum(values)):

@@ -42,7 +42,10 @@ class Manifold(NamedTuple):
         return self._replace_rotations(wrap_angles(change, self.angles), turn_between, x, other)
 
     def _replace_rotations(self, whole: Array, make: Callable[[Array, Array], Any], x: Array, y: Array) -> Any:
-        """Return `whole` with its rotation vectors replaced by what is made of those of x and y."""
+        """Return `whole` (..., n) with each of its rotation vectors replaced by `make` of those of x and y.
+
+        `rotations` are the places of their components, three after three.
+        """
         for i in range(0, len(self.rotations), 3):
             places = np.array(self.rotations[i : i + 3])  # of one rotation vector
             x, y = (v if np.shape(v) == np.shape(whole) else v + np.zeros(np.shape(whole)) for v in (x, y))
@@ -70,9 +73,10 @@ class Manifold(NamedTuple):
     def chart_move(
         self, function: Callable[[jax.Array], jax.Array], center: jax.Array, middle: jax.Array | None = None
     ) -> Any:
-        """Return the motion of states near `center` as moments are made of it: changes from `middle`, added to it.
+        """Return the motion f of states near `center` as a function of vectors, of which moments can be taken.
 
-        f -> m + (f(center plus (x - center)) difference m), with m = f(center) unless given; angles are continued.
+        x -> m + (f(center plus (x - center)) difference m), with m the `middle`, f(center) unless given: `plus` and
+        `difference` turn attitudes, + and - are those of vectors. Angles are continued over full turns.
         """
         continued = continue_angles(function, center, self.angles, self.angles)
         if not self.rotations:
@@ -91,7 +95,8 @@ class Manifold(NamedTuple):
     def reset_jacobian(self, change: jax.Array) -> jax.Array | None:
         """Return d((x + d) difference x')/dd at d = change, x' = x plus change (n, n): the identity but for attitudes.
 
-        By it errors about x are errors about x'; the right Jacobian of the rotations. None where all is the identity.
+        It turns errors about x into errors about x': its block for a rotation is the right Jacobian. None where there
+        are no rotations, and all is the identity. `plus` and `difference` turn attitudes, + is that of vectors.
         """
         if not self.rotations:
             return None

@@ -55,13 +55,13 @@ def _same_attributes(x: object, y: object) -> bool:
 
 
 def _same_array(value: Any, other: Any) -> bool:
-    """Return whether arrays have the same entries and type, NaN as NaN; keys by their data."""
+    """Return whether arrays have the same shape, type and entries; NaN equals NaN, random keys go by their data."""
     if value.shape != other.shape or value.dtype != other.dtype:
         return False
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value, other = jax.random.key_data(value), jax.random.key_data(other)
     a, b = np.asarray(value), np.asarray(other)
-    return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))
+    return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))  # kinds that have a NaN or NaT
 
 
 class Module(eqx.Module):
@@ -113,7 +113,10 @@ def readable(kind: T) -> T:
 
 
 def _write_repr(self: object) -> str:
-    """Return the object as text: one line, or a line for each part."""
+    """Return the object as text: one line of up to WIDTH characters, or a line for each part, LINES at most.
+
+    A part is an entry or a field; DEPTH is how far parts of parts are shown.
+    """
     whole = format_on_one_line(self, DEPTH)
     if len(whole) <= WIDTH:
         return whole
@@ -190,7 +193,7 @@ def _list_parts(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
-    """Return a few numbers as text, of more than that their type and shape."""
+    """Return up to FEW numbers as text; of more, or of traced or other ones, the type and shape, as float64[3,2]."""
     if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     numbers = np.asarray(value).tolist()
@@ -198,14 +201,17 @@ def _format_array(value: np.ndarray | np.generic | jax.Array) -> str:
 
 
 def _round_numbers(numbers: object) -> str:
-    """Return a number, or a list of lists of them, with four digits each."""
+    """Return a number, or lists of them within lists, as text with four digits each."""
     if isinstance(numbers, list):
         return f"[{', '.join(map(_round_numbers, numbers))}]"
     return f"{numbers:.4g}"
 
 
 def _join_first_items(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
-    """Join the first items as text, with the number of those left out; none below the last depth."""
+    """Return the first SOME items as text between `start` and `end`, and how many more of `count` there are.
+
+    `of` gives an item's text. Below the last depth (`depth` 0) "…" stands for all of them.
+    """
     if count and depth <= 0:
         return f"{start}…{end}"
     more = [f"… {count - SOME} more"] if count > SOME else []
@@ -218,7 +224,7 @@ def cut(text: str) -> str:
 
 
 def _format_table(value: object, depth: int) -> str:
-    """Return an object as a table of HTML, a row for each of its parts."""
+    """Return an object as a table of HTML, a row for each part (entry or field), whose own go `depth` tables deep."""
     rows = [
         f"<tr><th>{escape(name)}</th><td>{_format_cell(entry, depth - 1)}</td></tr>"
         for name, entry in _list_entries(value)
@@ -227,7 +233,7 @@ def _format_table(value: object, depth: int) -> str:
 
 
 def _list_entries(value: object) -> Iterable[tuple[str, object]]:
-    """Yield the parts of an object by name, and how many more there are."""
+    """Yield the first LARGE parts (entries or fields) of an object by name, and how many more there are."""
     entries = _list_parts(value)
     yield from islice(entries, LARGE)
     left = sum(1 for _ in entries)
@@ -236,7 +242,10 @@ def _list_entries(value: object) -> Iterable[tuple[str, object]]:
 
 
 def _format_cell(value: object, depth: int) -> str:
-    """Return a value as a cell of HTML: a line of text, which opens to a table of the value's parts if it has some."""
+    """Return a value as a cell of HTML: a line of text, which opens to a table of its parts if it is ours or a mapping.
+
+    Not below the last depth (0).
+    """
     text = escape(cut(format_on_one_line(value, depth)))
     opens = _is_ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_format_table(value, depth)}</details>" if opens and depth > 0 else text

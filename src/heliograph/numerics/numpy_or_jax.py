@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
 
 def is_traced(*values: object) -> bool:
-    """Return whether some number in these arrays or lists of numbers is traced."""
+    """Return whether some number in these arrays or trees is traced: stands, in a JAX trace, for one not yet known."""
     return any(
         isinstance(leaf, jax.core.Tracer)
         for value in values
@@ -37,7 +37,8 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
     """Return the first number of an array that was rounded to single precision, as it was meant and as it is.
 
     Known by its value, in double precision too: it is a number of single precision of many bits, and the shortest
-    decimal that single precision takes for it, which a user will have written, is another double. None if none is.
+    decimal that single precision takes for it, which a user will have written, is another double. None if none is. A
+    number of up to MEANT_BITS bits (0.5, 2^-30) is taken as meant.
     """
     numbers: np.ndarray = np.asarray(value)
     if numbers.dtype.kind != "f":
@@ -54,7 +55,10 @@ def find_rounded_to_single(value: object) -> tuple[float, float] | None:
 
 
 def warn_of_single(name: str, value: object) -> None:
-    """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1."""
+    """Warn, once in a process, of an array of single precision with a number that was rounded, as JAX makes 0.1.
+
+    `name` says which array it is; DOUBLE how to make one of double precision.
+    """
     if isinstance(value, jax.core.Tracer) or getattr(value, "dtype", None) != np.float32:
         return
     rounded = find_rounded_to_single(value)
@@ -75,7 +79,7 @@ def _warn_once(text: str) -> None:
 
 
 def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
-    """Trace a function in double precision; return the arrays that it holds, and the shape of its result."""
+    """Trace a function in double precision; return the arrays that it holds as constants, and its result's shape."""
     with jax.enable_x64(True):
         made = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
     shape: tuple[int, ...] = made.out_avals[0].shape
@@ -83,7 +87,7 @@ def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[An
 
 
 def trace_shape(name: str, function: Callable[..., Any], *arguments: object) -> tuple[int, ...]:
-    """Return the shape of a function's result, traced in double precision; warn of arrays in it that have less."""
+    """Return the shape of a function's result, traced in double precision; warn of arrays it holds in single one."""
     held, shape = constants(function, *arguments)
     for constant in held:
         if isinstance(constant, jax.Array):
@@ -122,13 +126,13 @@ CALLS = frozenset((
 def called_program(operation: JaxprEqn) -> ClosedJaxpr | None:
     """Return the program that an operation of a traced function calls on its operands; None if it calls none.
 
-    A jitted function within another is such a call, and one with a derivative of its own.
+    CALLS are the operations that do: a jitted function within another, and one with a derivative of its own.
     """
     if operation.primitive.name not in CALLS:
         return None
     params = operation.params
     program = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
-    return ClosedJaxpr(program, ()) if isinstance(program, Jaxpr) else program
+    return ClosedJaxpr(program, ()) if isinstance(program, Jaxpr) else program  # a Jaxpr here has no constants
 
 
 def plain(value: Any) -> float | jax.Array:
@@ -144,9 +148,9 @@ def stack_parts(parts: Sequence[object]) -> jax.Array | np.ndarray:
 
 
 def block_diagonal(blocks: Sequence[Any]) -> Any:
-    """Put matrices along the diagonal of a larger one, whose other entries are 0.
+    """Return a matrix with these matrices along its diagonal, and 0 elsewhere; by JAX where one is traced.
 
-    SciPy's own brings its whole library of linear algebra: a sixth of a second of a program's start.
+    SciPy's `block_diag` imports its whole library of linear algebra: a sixth of a second of a program's start.
     """
     if is_traced(blocks):
         return jax.scipy.linalg.block_diag(*blocks)
@@ -178,7 +182,7 @@ EQUAL = 1e-12  # relative: numbers that were computed in another order
 
 
 def equal_to_rounding(a: Any, b: Any) -> bool:
-    """Test whether all entries are equal to rounding; a traced one is equal to itself alone."""
+    """Test whether arrays have one shape and entries equal to rounding (EQUAL); a traced one equals only itself."""
     if is_traced(a, b) or np.shape(a) != np.shape(b):
         return a is b
     x, y = np.asarray(a), np.asarray(b)
@@ -186,7 +190,10 @@ def equal_to_rounding(a: Any, b: Any) -> bool:
 
 
 def within(own: Any, room: Any, believed: Any, radius: Any) -> bool:
-    """Test whether probabilities with their room are all within a radius of the believed ones."""
+    """Test whether probabilities `own`, each wrong by up to `room`, are all within a radius of the believed ones.
+
+    False where that is not known: of traced ones, or of another shape.
+    """
     if is_traced(own, room, believed, radius) or np.shape(own) != np.shape(believed):
         return False
     return bool(np.all(np.abs(own - believed) + room <= np.asarray(radius) + EQUAL))

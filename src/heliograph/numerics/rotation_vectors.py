@@ -30,7 +30,10 @@ def _entries_of(q: Array) -> tuple[Any, Any, Any, Any]:
 
 
 def quaternion_of(r: Array) -> Any:
-    """Return the unit quaternion (..., 4), w first, of rotation vectors (..., 3)."""
+    """Return the unit quaternion (..., 4), cos(|r| / 2) first, of rotation vectors r (..., 3), in radians.
+
+    The rest is sin(|r| / 2) / |r| times r, by series where |r|^2 is below SMALL, where they are exact to rounding.
+    """
     xp = _library(r)
     s = xp.sum(r * r, axis=-1, keepdims=True)  # |r|^2
     near = s < SMALL
@@ -41,7 +44,10 @@ def quaternion_of(r: Array) -> Any:
 
 
 def rotation_vector_of(q: Array) -> Any:
-    """Return the rotation vector (..., 3), at most pi long, of quaternions (..., 4) of any length; q and -q are one."""
+    """Return the rotation vector (..., 3), at most pi long, of quaternions (..., 4) of any length; q and -q are one.
+
+    Of q = (w, v), the real part w first; up to SMALL, of (|v| / w)^2, by a series.
+    """
     xp = _library(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     w, v = q[..., :1], q[..., 1:]
@@ -55,7 +61,7 @@ def rotation_vector_of(q: Array) -> Any:
 
 
 def multiply_quaternions(q: Array, p: Array) -> Any:
-    """Return the product of quaternions (..., 4): first the turn p, then q."""
+    """Return the product q p of quaternions (..., 4), the real part first: the turn p, and after it q."""
     xp = _library(q, p)
     a, b, c, d = _entries_of(q)
     e, f, g, h = _entries_of(p)
@@ -79,7 +85,10 @@ def turn_between(r: Array, other: Array) -> Any:
 
 
 def matrix_of(r: Array) -> Any:
-    """Return R (..., 3, 3), by which what the body sees is what the world sees, of rotation vectors (..., 3)."""
+    """Return the rotation matrix R (..., 3, 3) of rotation vectors (..., 3), from the body's axes to the world's.
+
+    R times a vector in the body's axes is the same vector in the world's.
+    """
     xp = _library(r)
     w, x, y, z = _entries_of(quaternion_of(r))
     rows = [

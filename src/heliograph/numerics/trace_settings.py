@@ -27,7 +27,7 @@ def trace_settings() -> tuple[object, ...]:
 
 @contextmanager
 def write_short_programs(short: bool = True) -> Iterator[None]:
-    """Write what is traced within as short programs, if `short`: what is the same for many points once, in a loop."""
+    """Let functions traced within the block be written as short programs, if `short`: with loops in place of copies."""
     token = _short.set(short)
     try:
         yield
@@ -47,9 +47,9 @@ def writes_short_programs() -> bool:
 
 
 def keep_for_derivatives(numbers: PyTree) -> PyTree:
-    """Mark numbers that a derivative backwards over rows keeps, where it computes all others of a row again.
+    """Return the numbers, marked to be kept by a derivative backwards over rows, which computes a row's others again.
 
-    For what most models have the same in every row, which is then computed once: factors of noises.
+    For what most models have the same in every row, as factors of noises: it is then computed once. KEPT is the mark.
     """
     mark: Callable[[Any, str], Any] = checkpoint_name  # untyped in JAX
     return jax.tree.map(lambda leaf: mark(leaf, KEPT), numbers)
@@ -57,7 +57,7 @@ def keep_for_derivatives(numbers: PyTree) -> PyTree:
 
 @contextmanager
 def use_precision(precision: type[np.floating[Any]]) -> Iterator[None]:
-    """Take numbers to be rounded to another precision than the arrays' own within the block.
+    """Let tolerances within the block be those of another precision than that of the arrays that are traced.
 
     C in single precision is written from functions that are traced in double precision.
     """

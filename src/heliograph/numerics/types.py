@@ -37,7 +37,7 @@ class NameWithUnit(str):
     unit: str
 
     def __new__(cls, name: str, unit: str) -> "NameWithUnit":
-        """Make the name, with its unit."""
+        """Return the name as a text with an attribute `unit`."""
         named = super().__new__(cls, name)
         named.unit = unit
         return named

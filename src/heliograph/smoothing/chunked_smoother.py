@@ -43,6 +43,8 @@ class SmoothedRows(NamedTuple):
 def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     """Smooth rows in chunks side by side; None where rows are few, or the filter is not linear or forgets too late.
 
+    A filter forgets how it began: from any two states it comes, over enough rows, to the same one.
+
     Args:
         filter: the filter, which can be smoothed.
         z: measurements (rows, received), NaN for what did not arrive.
@@ -86,7 +88,7 @@ def smooth_chunk(
         return select_state(k < end, step.back(law), law), None
 
     def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
-        """Return the law before a row, and the row's smoothed estimate."""
+        """Return the smoothed law before a row, from `law` behind it, and the row's smoothed estimate."""
         step, _k = item
         law_before, _ = pass_back(law, item)
         return law_before, step.estimate_from(law)
@@ -118,8 +120,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Smooth the chunks `which`, filtered from these states; None without native code.
 
-        They pass back from the end of their windows; or, with `later`, from the end of their own rows, where `later` is
-        the smoothed law.
+        They pass back from the end of their windows (their `own` rows and those that they look ahead); or, with
+        `later`, from the end of their own rows, where `later` is the smoothed law.
         """
         first = begun.first[which]
         is_given = np.full(len(first), later is not None)
@@ -153,11 +155,12 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
 
 def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: SmoothedChunk) -> None:
-    """Smooth again, in place, each chunk entered by another law than that with which the next one was left.
+    """Smooth again, in place, each chunk whose smoothed law at its end is not that at the beginning of the next one.
 
-    The last such chunk comes first: smoothed again from the next one's law, it is left by another law itself, with
-    which the chunk before it has to agree. A chunk begins in the state in which the one before it ends, the first one
-    in that of `states`.
+    Smoothing passes back, so a chunk is entered at its end, by the law `entered`, and left at its beginning, by the law
+    `left`. The last such chunk comes first: smoothed again from the next one's law, it is left by another law itself,
+    with which the chunk before it has to agree. Filtering begins in the state in which the chunk before ends, of the
+    first one in that of `states`.
     """
     wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
     for c in range(len(wrong) - 1, -1, -1):

@@ -32,7 +32,8 @@ EXCESS = 1.05  # ratio to the expected NIS from which on it is told: less does l
 def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
     """Return sums over the blocks of one run of s, h, s^2, s h and h^2.
 
-    s is the sum of e' S^-1 e over a block, and h the number of components of e that arrived in it.
+    s is the sum over a block of rows of e' S^-1 e, the squared innovation (NIS), and h the number of components of e
+    that arrived in it. All are 0 of a filter that has no NIS.
     """
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
@@ -40,18 +41,23 @@ def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
 
 
 def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
-    """Return `nis_sums` of the squares e' S^-1 e of each step, and of the number of components that arrived."""
+    """Return sums over blocks of steps of s, h, s^2, s h and h^2, s and h a block's sums of `nis` and of `received`.
+
+    `nis` is the square e' S^-1 e of each step's innovation, `received` the number of its components that arrived. The
+    steps are cut into BLOCKS parts, whose scatter will tell the standard error.
+    """
     xp, time = library(nis), len(nis)
     count = min(BLOCKS, time)
-    edges = [-(-time * i // count) for i in range(count + 1)]
+    edges = [-(-time * i // count) for i in range(count + 1)]  # rounded up
     s, h = (xp.stack([xp.sum(values[a:b]) for a, b in pairwise(edges)]) for values in (nis, received))
     sums: Array = xp.stack([xp.sum(values) for values in (s, h, s * s, s * h, h * h)])
     return sums
 
 
 def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
-    """Return the mean NIS per component, 1 for a consistent filter, and its standard error.
+    """Return the mean squared innovation e' S^-1 e (NIS) per component, 1 if consistent, and its standard error.
 
+    `sums` are those over blocks of s, h, s^2, s h and h^2: s the sum of NIS in a block, h its number of components.
     The error is that of a ratio, from the scatter of the blocks: the root of sum (s - ratio h)^2, over sum h.
     """
     s, h, ss, sh, hh = (float(total) for total in sums)
@@ -63,7 +69,10 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 
 
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
-    """Warn if a filter's NIS is significantly larger than its model predicts."""
+    """Warn if a filter's squared innovations (NIS) are more than EXCESS times what its model predicts, beyond chance.
+
+    `sums` are those that `nis_test` takes; chance are up to DEVIATIONS standard errors.
+    """
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
         warnings.warn(
@@ -81,9 +90,10 @@ class AbstractSmoothing(Module):
     """Choice of the states to be estimated, and of the later data that they are estimated from."""
 
     def estimates(self, steps: SmootherStep) -> Estimate:
-        """Return the estimates along time from smoother steps stacked along time, with the claim that remains.
+        """Return the estimates along time from smoother steps stacked along time, with the claim (worth) that remains.
 
-        Warns where the NIS of the filter says that it is not consistent: later data then make estimates worse.
+        Warns where the filter's squared innovations (NIS) say that it is not consistent: later data then make estimates
+        worse.
         """
         warn_if_inconsistent("smoothing", np.asarray(nis_sums(steps)))
         return _sweep_compiled(self, steps)

@@ -30,6 +30,8 @@ def smoother_steps(
 ) -> "tuple[PyTree, SmootherStep]":
     """Step a filter over rows of data; return its state after them, and its smoother steps stacked along time.
 
+    A smoother step is what a backward pass needs of a row.
+
     Args:
         filter: a filter that can be smoothed.
         measurements: rows (steps, received), or (steps,) of one number; NaN for what did not arrive.
@@ -52,7 +54,8 @@ def filter_rows_with_smoother_steps(
 ) -> tuple[PyTree, SmootherStep]:
     """Run a filter over rows of data; return its state after them, and the smoother step of each row, compiled.
 
-    As `smoother_steps`, of arrays that are checked, from `state` before the row of step `first`.
+    A smoother step is what a backward pass needs of a row; they are stacked along time. As `smoother_steps`, of arrays
+    that are checked: measurements z and inputs u, from `state` before the first row, the row of step `first`.
     """
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
@@ -63,7 +66,11 @@ def filter_rows_with_smoother_steps(
 
 
 def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractFilter:
-    """Return the filter planned for these inputs and complete data, with its smoother steps but for their means."""
+    """Return the filter planned for these inputs and complete data, with its smoother steps but for their means.
+
+    Planned: with covariances and gains computed ahead, since they depend on no data. A filter of which they do is
+    returned as it is.
+    """
     planned = filter.planned(inputs)
     if planned is filter:
         return filter
@@ -73,7 +80,8 @@ def plan_with_smoother_steps(filter: AbstractFilter, inputs: Array) -> AbstractF
 def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherStep:
     """Return the smoother steps for z = 0, of a filter whose covariances and gains depend on no data.
 
-    Their covariances and gains are those of all data; their means stand in for those that data will give.
+    Their covariances and gains are those of any data; their means stand in for those that data will give. `inputs` has
+    a row for each step.
     """
     zeros = jnp.zeros((len(inputs), filter.received))
     steps: SmootherStep = filter_rows_with_smoother_steps(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
@@ -81,10 +89,13 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
 
 
 def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
-    """Estimate each step's state given all data: one backward pass."""
+    """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time."""
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
-        """Smooth the state between two steps, given the smoothed one after both."""
+        """Smooth the state between two steps: return its law, to go on with, and the estimate of the plant's state.
+
+        `later` is the smoothed law after both.
+        """
         previous, step = pair
         law = step.back(later)
         return law, previous.estimate_from(law)
@@ -96,10 +107,13 @@ def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
 
 
 def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
-    """Estimate the mean of each step's state given all data: one backward pass."""
+    """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
-        """Smooth the mean between two steps, given the smoothed one after both."""
+        """Smooth the mean between two steps: return the filter's, to go on with, and its part that is the plant's.
+
+        `later` is the smoothed one after both.
+        """
         previous, step = pair
         mean = step.mean_back(later)
         return mean, _take_plant_mean(previous, mean)
@@ -116,7 +130,10 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
     times = jnp.arange(last + 1)
 
     def pass_one_step_back(done: jax.Array, later: Gaussian) -> Gaussian:
-        """Pass from the state after step k + lag - done to the one before it, unless the data end earlier."""
+        """Pass, for each step k of `times`, from the state after step k + lag - done to the one before it.
+
+        `done` counts the passes; of a step beyond `last`, where the data end, there is none, and the law stays.
+        """
         ahead = times + lag - done
         before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
         passed: Gaussian = jax.tree.map(
@@ -132,7 +149,10 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
 
 
 def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
-    """Estimate the state after one step given the data up to it, and up to each later one."""
+    """Estimate the state after one step, by number `step`, given the data up to it, and up to each later one.
+
+    Returns one estimate for each of these ends of the data, stacked.
+    """
     start = take_step(steps, step)
 
     def body(point: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:

@@ -23,7 +23,7 @@ def simulation_smoother(
     draws: int = 1000,
     seed: int = 0,
 ) -> Float[np.ndarray, "draws steps n"]:
-    """Draw paths of the states given all rows: of what smoothed means and covariances are the moments.
+    """Draw paths of the states given all rows, from the law whose moments are the smoothed means and covariances.
 
     The last state is drawn from its filtered law, each one before from its law given the state drawn after it:
     x_k = m + K (x_{k+1} - m-) + e. So whole paths are right, not each state alone: how long a level was passed, the
@@ -54,7 +54,7 @@ def simulation_smoother(
 
 @compile_in_float64
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
-    """Draw one path for each key (draws, steps, n), by one filter pass."""
+    """Draw one path of the states for each key (draws, steps, n): one filter pass, then a pass back for each draw."""
     _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), np.asarray(0))
     if steps.before is None:
         raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
@@ -66,7 +66,7 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
     """Draw one path (steps, n) back from the last step."""
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Draw the filter's state between two steps, given the one drawn after both; keep the plant's."""
+        """Draw the filter's state between two steps, given `later`, drawn after both; keep the plant's part of it."""
         previous, step, key = pair
         # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
         left, manifold = step.before.left, step.manifold

@@ -36,7 +36,10 @@ class SmootherStepRecursion(Recursion):
     own: int = eqx.field(static=True)
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, SmootherStep]:
-        """Predict and correct; return the state after, and the smoother step with its squared innovation."""
+        """Predict and correct by a row (z, u) of step k; return the state after, and the smoother step.
+
+        That holds what a backward pass needs of the row, and its squared innovation.
+        """
         z, u = row
         prior = self.filter.predict(state, u, k)
         after, innovation = self.filter.correct(prior, z, k)

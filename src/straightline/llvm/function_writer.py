@@ -37,21 +37,21 @@ class SharedSlots:
         self.base = ""
 
     def offset_of(self, node: Node) -> int:
-        """Return the offset of a number, assigned at its first use."""
+        """Return the offset of a shared number in bytes, assigned at its first use: 8 for each turn of its loops."""
         if node not in self.places:
             self.places[node] = self.size
             self.size += 8 * count_turns(node.block)
         return self.places[node]
 
     def load(self, writer: "FunctionWriter", node: Node) -> str:
-        """Load a shared number, a scalar."""
+        """Write the load of a shared number, a flag from its byte; return the name of the scalar."""
         address = self._write_address(writer, node)
         if node.type == "bool":
             return writer.add(f"trunc i8 {writer.add(f'load i8, ptr {address}, align 8')} to i1")
         return writer.add(f"load {LLVM[node.type]}, ptr {address}, align 8")
 
     def store(self, writer: "FunctionWriter", node: Node, name: str) -> None:
-        """Store a number, which the other function uses."""
+        """Write the store of a shared number, by its `name`, for the function of blocks to load; a flag as a byte."""
         kind = vector_type(node.type)
         address = self._write_address(writer, node)
         if node.type == "bool":
@@ -102,7 +102,7 @@ class FunctionWriter:
         self.asked_rows: list[PrefetchedRows] = []
 
     def add(self, text: str) -> str:
-        """Append an operation; return the new name of its result."""
+        """Append an operation in LLVM's text; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %t{self.count} = {text}")
         return f"%t{self.count}"
@@ -117,7 +117,7 @@ class FunctionWriter:
         self.label = label
 
     def write_block(self, block: Block) -> None:
-        """Write operations and statements in order."""
+        """Write a block's operations and statements, in order, as far as they are this function's (`mine`)."""
         for statement in block.items:
             if statement not in self.mine:
                 continue
@@ -132,7 +132,7 @@ class FunctionWriter:
                 self._write_guard(statement)
 
     def _note_name(self, node: Node, name: str) -> None:
-        """Note the name of a node's value, and store it where the other function reads it."""
+        """Note the LLVM name of a node's value; in the function of what runs share, store it if the other loads it."""
         self.scopes[-1][node] = name
         if self.single and node in self.slots.places:
             self.slots.store(self, node, name)
@@ -151,7 +151,7 @@ class FunctionWriter:
         return write_operation(node, [self.write_operand(a) for a in node.args], self.add)
 
     def write_operand(self, node: Node) -> str:
-        """Return the name of a number in all lanes."""
+        """Return the LLVM name of a node as a vector: noted in a scope, a constant, or a shared number in all lanes."""
         for scope in reversed(self.scopes):
             if node in scope:
                 return scope[node]
@@ -185,7 +185,7 @@ class FunctionWriter:
         return node.op in ("constant", "counter") or node not in self.mine or self.single
 
     def write_broadcast(self, name: str, type: Type) -> str:
-        """Return the name of a vector of a scalar."""
+        """Return the name of a vector with a scalar in all lanes; `single`: vectors have one."""
         kind = vector_type(type)
         first = self.add(f"insertelement {kind} poison, {LLVM[type]} {name}, i64 0")
         if self.single:
@@ -210,7 +210,7 @@ class FunctionWriter:
         return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
     def _write_base(self, owner: Buffer) -> str:
-        """Return the address of a buffer's memory, in this turn of the loops around it."""
+        """Return the address of a buffer's memory; in this turn of its loops, if it has a copy for each (`turning`)."""
         if owner not in self.turning:
             return self.bases[owner]
         key = ("base", owner)
@@ -221,7 +221,7 @@ class FunctionWriter:
         return base
 
     def write_address_of_turn(self, start: str, block: Block, bytes_: int) -> str:
-        """Return the address that belongs to this turn of the loops around a block; each turn has so many bytes."""
+        """Return the address from `start` on for this turn of the loops around a block, so many bytes for each turn."""
         index = ""
         for loop in list_loops_around(block):
             assert loop.counter is not None
@@ -231,7 +231,7 @@ class FunctionWriter:
         return self.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
     def _write_load(self, node: Node) -> str:
-        """Write the read of a number from a buffer: one for all lanes, one for each, or by indices that lanes have."""
+        """Write the load of a number: one for all lanes, one for each (`spread`), or by each lane's own indices."""
         buffer, offset, strides = node.value
         if not all(self._is_scalar(i) for i in node.args):
             return self._write_gather(node)
@@ -243,7 +243,7 @@ class FunctionWriter:
         return self.add(f"load {vector_type(node.type)}, ptr {address}, align {BITS[node.type] // 8}")
 
     def _write_scalar_load(self, node: Node) -> str:
-        """Load a number that all lanes share."""
+        """Write the load of a number that all lanes share; return its name, a scalar's, and note that it is read."""
         buffer, offset, strides = node.value
         self.read.add(buffer.owner[0])
         address = self._locate(buffer, offset, strides, node.args, f"i{BITS[node.type]}")
@@ -273,7 +273,7 @@ class FunctionWriter:
         return self.add(f"bitcast %i{bits} {loaded} to {vector_type(node.type)}") if node.type in REAL else loaded
 
     def _write_store(self, store: Store) -> None:
-        """Write the store of a number; where sums over runs are kept, add it to what is there, in lanes that count."""
+        """Write the store of a number; a sum over runs is added to what is there, but in lanes beyond the last run."""
         name, kind, bits = self.write_operand(store.node), vector_type(store.node.type), BITS[store.node.type]
         entry = f"[{self.sums[store.buffer]} x i64]" if store.buffer in self.sums else f"%i{bits}"
         address = self._locate(store.buffer, store.offset, store.strides, store.indices, entry)
@@ -328,7 +328,7 @@ class FunctionWriter:
             self._note_name(loop.results[k], final)
 
     def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
-        """Note the names of a loop's counter and of its carried numbers within a turn."""
+        """Note the LLVM names of a loop's counter and of its `carried` numbers, by their places, within a turn."""
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in carried:
@@ -337,7 +337,7 @@ class FunctionWriter:
             self._note_name(loop.counter, self.write_operand(loop.counter))
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
-        """Write the body and the latch of a loop of known length; return the names of the next turn's numbers."""
+        """Write a counted loop's body, and behind it the jump to the next turn; return the names of what that gets."""
         self.write_block(loop.body)
         following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")

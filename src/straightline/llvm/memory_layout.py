@@ -49,7 +49,7 @@ class ProgramParts(NamedTuple):
 
     @property
     def outputs_summed_in_memory(self) -> list[Buffer]:
-        """Return the outputs that are summed over runs."""
+        """Return the outputs that are summed over runs, but those that all runs share: these are multiplied later."""
         if self.summed is None:
             return []
         pairs = zip(self.outputs, self.summed.outputs, strict=True)
@@ -94,7 +94,9 @@ def split_shared_from_differing(
 
 
 def choose_vector_width(items: Iterable[Any]) -> int:
-    """Return the most runs of a vector: twice as many where most of what is computed has 32 bits, not 64.
+    """Return the most runs of a vector: WIDEST, or twice as many where most of what is computed has 32 bits, not 64.
+
+    An elementary function or a hash (threefry) counts as LONG operations.
 
     A step of a particle filter that hashes two words and makes four normal numbers of floats of them, among 112
     operations on doubles, takes 12 ns a particle with 16 runs and 19 with 8; among 281 it takes 15 and 31.
@@ -123,8 +125,8 @@ class MemoryLayout(NamedTuple):
 def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
     """Place what differs between runs in the memory of a thread, and what the program fills for all in shared memory.
 
-    `mine` are the items of the function of blocks. What it reads of memory that is filled anew in each turn of a loop
-    has a place for each turn.
+    `mine` are the items of the function of blocks, which computes what differs. What it reads of shared memory that is
+    filled anew in each turn of a loop has a place for each turn. Places are offsets in bytes.
     """
     owners = dict.fromkeys(x.owner[0] for x in parts.items if isinstance(x, Buffer))
     added = set(parts.outputs_summed_in_memory)
@@ -140,7 +142,10 @@ def lay_out_memory(parts: ProgramParts, mine: Collection[Any]) -> MemoryLayout:
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
-    """Raise unless sums are only stored to: a number that is read again needs memory of its own."""
+    """Raise Unsupported unless `outputs`, the sums over runs, are only stored to, and real.
+
+    What is read again, or lies in another array, needs a run's own number, which a sum has not.
+    """
     read = _find_read_buffers(items) if outputs else set()
     if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
         raise Unsupported("a sum over runs of numbers that are used again")

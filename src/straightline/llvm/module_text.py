@@ -121,7 +121,7 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
 
 
 def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
-    """Return an array's buffer if it is all of one that the program filled; else copy the array."""
+    """Return an array as it is if it is all of a buffer that the program fills and no result has taken; else a copy."""
     buffer = value.buffer
     whole = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
     alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
@@ -132,7 +132,7 @@ def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: l
 
 
 def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return an array stored entry by entry in new memory, constants too."""
+    """Return an array of nodes or in memory, constants too, stored entry by entry in new memory."""
     flat: list[Node] = lowering.nodes(value).ravel().tolist()
     type: Type = value.type if isinstance(value, StridedArray) else flat[0].type
     buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
@@ -203,7 +203,7 @@ def write_module(
 
 
 def _count_operations(items: Iterable[Any]) -> Counter[str]:
-    """Count the operations by name, constants aside; raise if they are too many."""
+    """Count the operations by name, constants aside; raise Unsupported if they are more than LONGEST."""
     counts = Counter([x.op for x in items if isinstance(x, Node)])
     del counts["constant"]
     if counts.total() > LONGEST:
@@ -285,7 +285,7 @@ def _write_block_function(writer: FunctionWriter, parts: ProgramParts, layout: M
 def _write_mover_call(
     writer: FunctionWriter, names: dict[Buffer, str], buffer: Buffer, kind: Literal["take", "give"]
 ) -> MoverOptions:
-    """Write the call that takes a buffer's rows into lanes or gives them back; return what it calls."""
+    """Write the call that moves a block of runs' rows of a buffer into lanes ("take") or back; return what it calls."""
     few = buffer.size if buffer.size < FEW else 0
     called = MoverOptions(bits=BITS[buffer.type], inwards=kind == "take", squared=buffer.type in SQUARED, few=few)
     pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
@@ -296,7 +296,7 @@ def _write_mover_call(
 def _request_rows_ahead(
     writer: FunctionWriter, parts: ProgramParts, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer]
 ) -> None:
-    """Let the longest loop, if there is one, ask for the memory of inputs and outputs before it is used."""
+    """Let the longest loop, if any, prefetch memory: of inputs that are taken next, and of outputs to be given."""
     writer.asking_loop = find_longest_loop(x for x in parts.program.graph.top.items if x in writer.mine)
     if writer.asking_loop is not None:
         writer.asked_rows = _locate_rows(writer, names, taken, given, parts.width, writer.asking_loop)
@@ -305,7 +305,7 @@ def _request_rows_ahead(
 def _locate_rows(
     writer: FunctionWriter, names: dict[Buffer, str], taken: list[Buffer], given: list[Buffer], width: int, loop: Loop
 ) -> list[PrefetchedRows]:
-    """Locate the rows that a loop asks for: the next block's inputs (`taken`), and this block's outputs (`given`)."""
+    """Return the rows that a loop prefetches: the next block's inputs (`taken`), and this block's outputs (`given`)."""
     first_of_next, results = writer.add(f"add i64 %first, {WIDTH}"), list[PrefetchedRows]()
     for buffer in (*taken, *given):
         bytes_of_run, writes = buffer.size * BITS[buffer.type] // 8, buffer in given
@@ -374,7 +374,7 @@ def _write_shared_function(blocks: FunctionWriter, parts: ProgramParts, layout: 
 
 
 def _write_run_function(body: str, writer: FunctionWriter) -> str:
-    """Return the function `run` around its body; in single precision alone, subnormal numbers are zeros in it."""
+    """Return the text of the function `run` around its body; if the writer `flushes`, subnormals are zeros in it."""
     before = after = ""
     if writer.flushes:
         before, after = "  %control = call i32 @hg_flush()\n", "  call void @hg_restore(i32 %control)\n"
@@ -382,7 +382,7 @@ def _write_run_function(body: str, writer: FunctionWriter) -> str:
 
 
 def _write_pointers(writer: FunctionWriter, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
-    """Load the addresses of inputs, tables and outputs, the bases of their buffers; return the names of all."""
+    """Write the loads of the buffers' addresses, and last that of shared memory; return the names by buffer."""
     names: dict[Buffer, str] = {}
     for number, buffer in enumerate([*pointers, None]):
         address = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")

@@ -35,7 +35,7 @@ def vector_type(type: Type) -> str:
 
 
 def write_literal(value: float | int | bool, type: Type) -> str:
-    """Return a constant; real ones by their bits as doubles."""
+    """Return the LLVM text of a constant; a real one, also a float, by the bits of it as a double."""
     if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":
@@ -89,7 +89,10 @@ def name_called_function(node: Node) -> str:
 
 
 def _write_comparison(op: str, type: Type) -> str:
-    """Return LLVM's instruction for a comparison of numbers of this type."""
+    """Return LLVM's instruction for a comparison of numbers of this type.
+
+    Of NaN all are false, but for `ne`, which is true ("une": unordered or not equal; o...: ordered).
+    """
     if type in REAL:
         return "fcmp une" if op == "ne" else f"fcmp o{op}"
     if op in ("eq", "ne"):
@@ -178,7 +181,10 @@ def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
 
 
 def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
-    """Write a shift of integers; return the name of its result. By all bits or more, 0 is left, or the sign."""
+    """Write a shift of integers; return the name of its result. By all bits or more, 0 is left, or the sign.
+
+    `names` are those of the number and of the shift, `text` is the vector's type; `emit` appends an operation.
+    """
     op, type, (a, b), by = node.op, node.args[0].type, names, node.args[1]
     instruction = {"shift_left": "shl", "shift_right": "lshr"}.get(op, "ashr")
     if by.op == "constant" and 0 <= by.value < BITS[type]:
@@ -193,7 +199,10 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
 
 
 def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
-    """Write a conversion between types, saturating from reals to integers; return the name of its result."""
+    """Write a conversion between types; return the name of its result.
+
+    A real number as an integer is truncated, the type's limit where it is beyond, and 0 of NaN (LLVM's `.sat`).
+    """
     operand_type, result_type = vector_type(source), vector_type(target)
     if source == target or LLVM[source] == LLVM[target]:
         return name
@@ -212,7 +221,8 @@ def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
 def write_fused(node: Node, product: Node, names: list[str], emit: Emit) -> str:
     """Write a b + c, c - a b or a b - c, rounded once, from the names of a, b, c; return the name of the result.
 
-    `product`: the argument a b of the node, whose place tells the sign.
+    `product`: the argument a b of the node, whose place tells the sign: as the second one of a difference it is
+    subtracted, as the first one c is.
     """
     reals = vector_type(node.type)
     a, b, c = names

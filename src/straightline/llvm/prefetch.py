@@ -34,10 +34,10 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
 
 
 def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
-    """Return how many cache lines a loop asks for in each of its turns, so that it asks for all rows of W runs.
+    """Return how many cache lines a loop prefetches in each of its turns, so that in all it does for rows of W runs.
 
-    0 where these take longer than its operations: a loop that does little but move numbers hides nothing beside them.
-    `bytes` are those of a row, `width` is W.
+    0 where these take longer than its operations (a line as long as PATIENCE of them): a loop that does little but move
+    numbers hides nothing beside them. `bytes` are those of a row, one run's numbers; `width` is W.
     """
     lines = -(-bytes * width // ((loop.length or 1) * LINE))
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
@@ -47,7 +47,7 @@ def count_cache_lines_per_turn(bytes: int, width: int, loop: Loop) -> int:
 def write_prefetch_requests(
     rows: PrefetchedRows, turns: int, counter: str, lanes: str, add: Callable[[str], str]
 ) -> list[str]:
-    """Return the lines of LLVM IR by which one turn of a loop asks for its share of the memory of some rows.
+    """Return the lines of LLVM IR by which one turn of a loop prefetches its share of the memory of some rows.
 
     Args:
         rows: the rows.
@@ -56,6 +56,7 @@ def write_prefetch_requests(
         lanes: text of the number of rows.
         add: appends an operation, and names its result.
     """
+    # This turn's share begins at counter / turns of all bytes.
     done = add(f"mul i64 {add(f'mul i64 {counter}, {rows.bytes}')}, {lanes}")
     place = add(f"getelementptr i8, ptr {rows.start}, i64 {add(f'udiv i64 {done}, {turns}')}")
     lines = [add(f"getelementptr i8, ptr {place}, i64 {LINE * k}") for k in range(rows.lines)]

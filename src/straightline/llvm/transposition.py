@@ -22,13 +22,13 @@ class TextLines:
         self.count = 0
 
     def add(self, text: str) -> str:
-        """Append an operation; return the new name of its result."""
+        """Append an operation in LLVM's text; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"
 
     def write_loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
-        """Write a loop: for (i = begin; i + step <= end; i += step) body."""
+        """Write a loop: for (i = begin; i + step <= end; i += step) body(i), i a name; `name` begins its labels."""
         before, head, inside, after = f"{name}.before", f"{name}.head", f"{name}.inside", f"{name}.after"
         self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
         self.lines.append(f"  %{name}.i = phi i64 [{begin}, %{before}], [%{name}.next, %{inside}]")
@@ -83,7 +83,10 @@ def write_mover(move: MoverOptions, width: int) -> str:
 
 
 def _write_row_addresses(text: TextLines, bits: int, lanes: range) -> list[str]:
-    """Write the address of the first entry of each lane's run, the last run for lanes beyond it; return their names."""
+    """Write the address of the first entry of each lane's run; return their names. Lanes beyond it have the last run's.
+
+    Runs lie one after another, `%size` numbers of so many bits each; lane 0 has run `%first`.
+    """
     rows = []
     for lane in lanes:
         run = text.add(f"add i64 %first, {lane}")
@@ -128,6 +131,8 @@ def _write_address(bits: int, start: str, number: int) -> str:
 
 def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
     """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
+
+    By one shuffle for each register: of what was chosen so far and its own numbers, which a mask counts from `side` on.
 
     places: for each lane the number of the register that has its number, and the place there.
     """
@@ -180,7 +185,10 @@ def _make_square_transposer(
 
 
 def _exchange_squares(text: TextLines, rows: list[str], half: int, bits: int) -> list[str]:
-    """Return rows with the off-diagonal squares of side `half` exchanged: one step of a transposition."""
+    """Return rows (names of registers) with their off-diagonal squares of side `half` exchanged.
+
+    That is one step of a transposition; the others have squares of half the side, and so on.
+    """
     exchanged, side = rows[:], len(rows)
     for i in range(side):
         if i & half:
@@ -202,7 +210,10 @@ def _make_entry_mover(
     """Return a function that writes the move of entry i of each run, to its lane or back; arguments as above."""
 
     def write_entry(i: str) -> None:
-        """Write the move of each lane, one after another."""
+        """Write the move of entry i of each lane, one after another: from its run to the lanes, or back.
+
+        Entry i of `width` lanes is a row of them, of which these, `group` and on, are moved.
+        """
         base = text.add(f"mul i64 {i}, {width}")
         base = text.add(f"add i64 {base}, {group}")
         base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")

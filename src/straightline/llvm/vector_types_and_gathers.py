@@ -31,7 +31,7 @@ def gather_name(bits: int, spread: bool) -> str:
 def write_gather(bits: int, spread: bool, width: int) -> str:
     """Write `%i64 @hg_gather64_table(ptr start, %i64 places)`, which loads in each lane the number at its place.
 
-    If `spread`, a place has a number for each lane, of which each lane loads its own.
+    Numbers have so many bits. If `spread`, a place has a number for each lane, of which each lane loads its own.
     """
     # The vector is put together lane by lane, from one of which no number is set ("poison").
     vector, text, gathered = f"%i{bits}", TextLines(), "poison"

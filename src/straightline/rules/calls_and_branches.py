@@ -23,7 +23,7 @@ CALLS = (
 
 
 def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Inline the function of a call (jit, custom_jvp, ...)."""
+    """Return the results of a call (jit, custom_jvp, ...), its function's program written in its place."""
     params = equation.params
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
     return lowering.inline_program(inner, inputs)
@@ -35,7 +35,10 @@ def _inline_custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: lis
 
 
 def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Inline a composed operation, such as frexp in JAX from 0.12 on, by its definition in others."""
+    """Return the results of a composed operation, such as frexp in JAX from 0.12 on, by its definition in others.
+
+    The definition is traced, for arguments of these shapes and types, and written in the operation's place.
+    """
     primitive = equation.params["_prim"]
 
     def expand(*leaves: jax.Array) -> list[jax.Array]:
@@ -49,7 +52,7 @@ def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _select_platform(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Select the branch of a program for CPUs."""
+    """Return the number of the branch for CPUs, a constant; where none names them, the last one, for any platform."""
     platforms = equation.params["platforms"]
     number = next((i for i, names in enumerate(platforms) if names is not None and "cpu" in names), len(platforms) - 1)
     return [lowering.make_known_array(np.int32(number))]
@@ -84,7 +87,7 @@ def _lower_cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> 
 
 
 def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[Node]:
-    """Return for each branch whether it is taken; indices out of range select the first or last.
+    """Return for each of `count` branches the node of whether it is taken; indices beyond take the first or the last.
 
     `which` is the index, or a flag, by itself or as an integer, that chooses among two.
     """
@@ -144,7 +147,7 @@ def _count_block_nodes(block: Block) -> int:
 
 
 def _move_statements_out(block: Block, outer: Block) -> None:
-    """Move the statements of a block into the one around it."""
+    """Move the operations and statements of a block into the one around it, with its record of nodes to be reused."""
     for statement in block.items:
         statement.block = outer  # type: ignore[union-attr]
     outer.items += block.items

@@ -97,9 +97,10 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
 def _apply_plain(
     *leaves: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
 ) -> list[Any]:
-    """Compute the plain function, not the native one, under its levels of `vmap`, the innermost first.
+    """Return the results of an operation's plain function, not its native one, under its levels of `vmap`.
 
-    `sizes` is a parameter of the primitive only.
+    A level has an axis, or None, for each argument; the innermost comes first. `sizes` is a parameter of the primitive,
+    not needed here.
     """
     function = jaxpr_as_fun(program.plain)
     for axes in levels:
@@ -110,7 +111,7 @@ def _apply_plain(
 def _find_result_shapes(
     *_: Any, program: _OperationProgram, levels: tuple[Axes, ...], sizes: tuple[int, ...]
 ) -> list[Any]:
-    """Return shapes and types of the results: those of the plain function, behind an axis for each level of vmap."""
+    """Return shapes and types of the results: the plain function's, behind the `sizes` of the levels of `vmap`."""
     return [jax.core.ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.plain.out_avals]
 
 
@@ -118,7 +119,10 @@ def _batch_operation(
     leaves: Sequence[Any], axes: Sequence[int | None], *, program: _OperationProgram, levels: tuple[Axes, ...],
     sizes: tuple[int, ...],
 ) -> tuple[list[Any], list[int]]:  # fmt: skip
-    """Add a level of `vmap`, whose axis becomes the first one."""
+    """Return the results of an operation under a further `vmap`, as one operation with one more level.
+
+    `axes` has for each argument its axis of the batch, None if it has none; that axis becomes the first one.
+    """
     moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, axes, strict=True)]
     level = tuple(None if axis is None else 0 for axis in axes)
     size = next(x.shape[0] for x, axis in zip(moved, level, strict=True) if axis == 0)
@@ -127,7 +131,7 @@ def _batch_operation(
 
 
 def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> tuple[list[Any], list[Any]]:
-    """Return the plain function's results and their tangents, by the arguments that have tangents."""
+    """Return the plain function's results and their tangents, by those arguments (primals) that have tangents."""
     has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
     def call(*varying: Any) -> list[Any]:
@@ -142,9 +146,10 @@ def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: An
 
 
 def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Inline the native function; the plain one where native code does not take that, or it has too many operations.
+    """Return the results of an operation by its native function, written in its place, or by the plain one.
 
-    Known zeros of the arguments decide how many it has: so it is tried.
+    That is where native code does not take the native one, or it has more than MANY_TERMS operations. How many it has
+    depends on known zeros of the arguments: so it is tried.
     """
     program: _OperationProgram = equation.params["program"]
     try:
@@ -155,20 +160,24 @@ def _apply_native(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
 
 
 def _trace_in_loops(lowering: Lowering, equation: JaxprEqn, function: Callable[..., list[Any]]) -> ClosedJaxpr:
-    """Trace a function of one item, once for equal shapes, in a loop over each level of `vmap`."""
+    """Return the program of a function of one item in a loop for each level of `vmap`, traced once for equal shapes."""
     program, levels = equation.params["program"], equation.params["levels"]
     kinds = tuple((v.aval.shape, v.aval.dtype) for v in equation.invars)  # type: ignore[attr-defined]
     key = program, function is program.native, levels, kinds
     if key not in lowering.kernels:
         for axes in levels:
             function = partial(_apply_one_by_one, function, axes)
+        # In the precision that was JAX's when the operation was called.
         with jax.enable_x64(program.x64):
             lowering.kernels[key] = jax.make_jaxpr(function)(*(make_placeholder(*kind) for kind in kinds))
     return lowering.kernels[key]
 
 
 def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: Any) -> list[Any]:
-    """Apply a function to one entry of a batch after another; `axes`: 0 for leaves that have a batch, else None."""
+    """Return a function's results for one entry of a batch after another, stacked: `vmap` in a loop.
+
+    `axes` is 0 for leaves that have a batch, along their first axis, and None for those that all entries share.
+    """
 
     def call(entries: list[Any]) -> list[Any]:
         """Call the function for one entry of each leaf that has a batch."""

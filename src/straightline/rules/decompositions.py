@@ -40,7 +40,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     rounding = eps * jnp.sqrt(sum((1 if i == j else 2) * x * x for (i, j), x in entries.items())) / n
 
     def goes_on(state: tuple[Numbers, Numbers, jax.Array]) -> jax.Array:
-        """Return whether an off-diagonal entry is above rounding, and sweeps are left."""
+        """Return whether an entry above the diagonal exceeds `rounding`, and fewer than SWEEPS sweeps are done."""
         entries, _vectors, sweeps = state
         large = [jnp.abs(entries[pair]) > rounding for pair in combinations(range(n), 2)]
         return jnp.any(jnp.stack(large)) & (sweeps < SWEEPS)
@@ -48,7 +48,7 @@ def eigh(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     turns, turn = _make_tournament_turn(n)
 
     def sweep(state: tuple[Numbers, Numbers, jax.Array]) -> tuple[Numbers, Numbers, jax.Array]:
-        """Rotate each pair once; after all turns each row is in its place again."""
+        """Rotate each pair of rows once, so that its entry becomes 0; after `turns` turns each row is in its place."""
         entries, vectors, sweeps = state
         (entries, vectors), _ = jax.lax.scan(turn, (entries, vectors), length=turns)
         return entries, vectors, sweeps + 1
@@ -80,7 +80,10 @@ def _make_tournament_turn(
     moved = [*((i + 1) % turns for i in range(turns)), *range(turns, n)]  # place i gets the row at place moved[i]
 
     def turn(state: tuple[Numbers, Numbers], _: None) -> tuple[tuple[Numbers, Numbers], None]:
-        """Rotate each pair of rows in (entries of A, eigenvectors), then move the rows on."""
+        """Rotate each of `pairs` of rows in (entries of A, eigenvectors), then move the rows on, from places `moved`.
+
+        Of A only the entries (i, j), i <= j, are kept.
+        """
         entries, vectors = map(dict, state)
         for p, q in pairs:
             _rotate_in_place(entries, vectors, p, q, n)
@@ -112,11 +115,14 @@ def _rotate_in_place(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> No
 def _sort_by_transposition(
     values: list[jax.Array], columns: list[list[jax.Array]]
 ) -> tuple[list[jax.Array], list[list[jax.Array]]]:
-    """Return eigenvalues in ascending order, with their columns, by odd-even transposition, which needs no branches."""
+    """Return eigenvalues in ascending order, with their columns (eigenvectors), by odd-even transposition.
+
+    That exchanges neighbours only, in the same order of places whatever the data: it needs no branches.
+    """
     n = len(values)
 
     def exchange_neighbours(state: tuple[list[jax.Array], list[list[jax.Array]]], _: None) -> tuple[Any, None]:
-        """Exchange neighbours in the wrong order: at even places, then at odd ones."""
+        """Exchange neighbours of n values in the wrong order: at even places, then at odd ones, with their columns."""
         values, columns = list(state[0]), list(state[1])
         for i in (*range(0, n - 1, 2), *range(1, n - 1, 2)):
             _exchange_if_descending(values, columns, i)
@@ -127,7 +133,7 @@ def _sort_by_transposition(
 
 
 def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
-    """Exchange places i and i + 1, in place, unless they are in ascending order."""
+    """Exchange values i and i + 1, and their columns, in the lists, unless they are in ascending order."""
     wrong = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
     low, high = columns[i], columns[i + 1]
@@ -136,7 +142,7 @@ def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Arra
 
 
 def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return eigenvectors and eigenvalues of small symmetric matrices, by `eigh` written out."""
+    """Return eigenvectors and eigenvalues of symmetric matrices of up to FEW rows, by `eigh` written out."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-1] > FEW or equation.params.get("subset_by_index") is not None:
@@ -145,7 +151,10 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
 
 
 def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn, matrices: Value) -> list[Value]:
-    """Return the results of a program of one matrix for each of many, along leading axes, one after another."""
+    """Return the results of a program of one matrix for each of many, along leading axes, one after another.
+
+    The program is written out once for each; its k-th results, entry by entry, become the k-th array.
+    """
     (single,) = program.in_avals
     leading = matrices.shape[: len(matrices.shape) - len(single.shape)]
     flat = lowering.nodes(matrices).reshape(math.prod(leading), *single.shape)
@@ -197,7 +206,10 @@ def _exchange_if(condition: jax.Array, items: list[jax.Array], i: int, j: int) -
 
 
 def permutation(pivots: jax.Array, size: int) -> jax.Array:
-    """Return the order of `size` rows after the exchanges of row j with row pivots[j] >= j, one after another."""
+    """Return the order of `size` rows after the exchanges of row j with row pivots[j] >= j, j = 0, 1, ...
+
+    An exchange is a selection with each row that may be meant, since data decide the pivots.
+    """
     order = list(jnp.arange(size, dtype=pivots.dtype))
     for j in range(len(pivots)):
         for i in range(j + 1, size):
@@ -206,7 +218,7 @@ def permutation(pivots: jax.Array, size: int) -> jax.Array:
 
 
 def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the factors, pivots and order of rows of small square matrices, by `lu` written out."""
+    """Return the factors (L and U in one), pivots and order of rows of square matrices up to FEW rows, by `lu`."""
     avals: list[Any] = [v.aval for v in equation.invars]
     shape = avals[0].shape
     if shape[-2] != shape[-1] or shape[-1] > FEW:

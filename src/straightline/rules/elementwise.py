@@ -26,7 +26,7 @@ WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i
 
 
 def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
-    """Return the entries of several arrays in row-major order, axes of length 1 repeated."""
+    """Return the entries of several arrays in row-major order, repeated along axes of length 1 to fill a shape."""
     size = math.prod(shape)
     return [
         [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()
@@ -38,7 +38,7 @@ def _make_elementwise_rule(op: str) -> Rule:
     """Return the rule of an operation that is applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return a node of the operation for each entry of the result."""
+        """Return a node of the operation `op` for each entry of the result, of the arguments' entries there."""
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
         return [
             arrange_nodes(
@@ -50,10 +50,10 @@ def _make_elementwise_rule(op: str) -> Rule:
 
 
 def _make_rule_of_entries(function: Any) -> Rule:
-    """Make a rule from one of entries: function(graph, type, parameters, *entries)."""
+    """Return the rule that makes each entry of the result by function(graph, type, parameters, *entries)."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return what the function makes of the arguments' entries, for each entry of the result."""
+        """Return for each entry of the result what `function` makes of the arguments' entries there."""
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
         entries = zip(*broadcast_entries(inputs, shape), strict=True)
         return [arrange_nodes([function(graph, type, equation.params, *entry) for entry in entries], shape)]
@@ -62,14 +62,14 @@ def _make_rule_of_entries(function: Any) -> Rule:
 
 
 def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
-    """Select a where the condition holds, else b: of numbers or of keys."""
+    """Return the node of a where the condition holds, else b; of keys of random numbers word by word."""
     if isinstance(a, RandomKey):
         return RandomKey(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
     return graph.node("select", a.type, condition, a, b)
 
 
 def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -> Any:
-    """Return the case whose number is `which`, by one selection after another."""
+    """Return the case whose number is `which`, a flag or an integer, by selections from the last case back."""
     if len(cases) == 2 and which.type == "bool":
         return select(graph, which, cases[1], cases[0])
     chosen = cases[-1]
@@ -80,13 +80,14 @@ def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -
 
 def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Lower `select_n`, of numbers or of keys: the first input says for each entry which of the others is taken."""
+    # The type "u32" and no parameters: selections have the type of their cases.
     shape = result_shape(equation)
     entries = zip(*broadcast_entries(inputs, shape), strict=True)
     return [arrange_nodes([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
 
 
 def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Compute x^n of a whole n, params["y"], by repeated squaring."""
+    """Return x^n of a whole n, params["y"], by repeated squaring; for n < 0 one over x^-n."""
     exponent = abs(params["y"])
     factors, square = [], x  # the power of x whose exponent is that of the lowest bit that is left
     while exponent:
@@ -116,7 +117,7 @@ def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Read numbers as others of as many bits, or each as two words, the low one first."""
+    """Return the bits of numbers read as others of as many bits, or of 64 bits as two words each, the low one first."""
     (x,), type, shape, node = inputs, result_type(equation), result_shape(equation), lowering.graph.node
     numbers = x.ravel().tolist()
     kinds = {n.type for n in numbers}
@@ -132,7 +133,7 @@ def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return 1 / (1 + e^-x)."""
+    """Return the node of the logistic function 1 / (1 + e^-x); `params`, those of the operation, are not used."""
     unit = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
     return graph.node("div", type, unit, graph.node("add", type, unit, power))
@@ -159,7 +160,7 @@ def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: Node) -> Node:
-    """Evaluate a polynomial by Horner's rule, of coefficients from degree 0 up."""
+    """Return the node of c_0 + c_1 x + c_2 x^2 + ... by Horner's rule; `params`, of the operation, are not used."""
     value = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         value = graph.node("add", type, graph.node("mul", type, value, x), c)
@@ -180,7 +181,7 @@ def _make_total_order_rule(op: str) -> Callable[..., Node]:
     """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
 
     def rank_by_bits(graph: Graph, x: Node) -> Node:
-        """Return a float's bits as an unsigned integer, in the order of the floats; other numbers as they are."""
+        """Return a real number as an unsigned integer of the same order, made of its bits; other numbers unchanged."""
         # All bits of a negative number are turned round, of others the sign's.
         if x.type not in REAL:
             return x
@@ -195,7 +196,10 @@ def _make_total_order_rule(op: str) -> Callable[..., Node]:
 
 
 def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
-    """Return the number next to x towards y: its bits, as an integer, and one more or less; y of equal ones."""
+    """Return the number next to x towards y, y if they are equal, NaN if one is NaN.
+
+    Its bits, as an integer, are those of x and one more or less.
+    """
     whole, smallest = WORDS[type][1], float(np.finfo(DTYPES[type]).smallest_subnormal)
     node, zero, one = graph.node, graph.constant(0.0, type), graph.constant(1, whole)
     bits = node("bitcast", whole, x)

@@ -25,7 +25,10 @@ from straightline.strided_arrays import contiguous_strides
 
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Gather windows at clipped indices; where the mode fills, a window that is not inside is filled with a value."""
+    """Lower `gather`: return the windows of x at rows of indices, these clipped so that each lies inside.
+
+    Where the operation's mode fills, a window that is not inside is filled with a value instead.
+    """
     x, indices = inputs
     if not fills_outside(equation):
         return [_gather_clipped(equation, lowering, x, indices)]
@@ -38,7 +41,10 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 
 
 def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
-    """Return for each row of indices whether its window is inside an array of this shape."""
+    """Return for each row of indices the node of whether its window is inside an array of this shape.
+
+    A row has a start for each of the operation's axes; `slice_sizes` is the window's shape.
+    """
     axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
     for row in np.ndindex(*flags.shape):
@@ -50,7 +56,10 @@ def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], i
 
 
 def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Gather at indices that are clipped to the array; where data decide them, all places are compared."""
+    """Return the windows of x at indices, clipped to the array: of known ones the nodes that are there.
+
+    Where data decide an index, it is compared with all places.
+    """
     known = known_integers(indices)
     if known is None:
         return _gather_by_cases(lowering, equation, x, indices)
@@ -64,9 +73,10 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
 def _find_gathered_places(
     shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
 ) -> np.ndarray:
-    """Return the places in the flat array that a gather takes at known indices: a filter has each a dozen times.
+    """Return the places in the flat array, of this shape, that a gather takes at known indices.
 
-    They have the axes of the indices, of shape `of`, then those of the window, moved to where the result has them.
+    They have the axes of the indices (int64 `indices` of shape `of`, but the last), then those of the window, moved to
+    where the result has them. Kept, since a filter has each gather a dozen times.
     """
     known = np.frombuffer(indices, dtype=np.int64).reshape(of)
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
@@ -138,7 +148,7 @@ def _gather_from_memory(
 
 
 def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, number: int) -> np.ndarray:
-    """Replace the indices that depend on data by a number."""
+    """Return the indices with those of one `column`, the axis, that depend on data replaced by a number."""
     replaced = indices.copy()
     for row in np.ndindex(*indices.shape[:-1]):
         node = indices[(*row, column)]

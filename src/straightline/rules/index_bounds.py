@@ -30,7 +30,7 @@ def clamp_place(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 
 def is_inside(graph: Graph, start: Node, last: int) -> Node:
-    """Return the node of whether a place is one of 0 ... last."""
+    """Return the node of whether a place is one of 0 ... last; an unsigned one cannot be below 0."""
     below = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
         return below
@@ -49,7 +49,7 @@ def convert_to_32_bits(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
 
 
 def make_fill_value(lowering: Lowering, equation: JaxprEqn) -> Node:
-    """Return the node of the value that a gather has in place of what is outside of the array."""
+    """Return the node of the value that a gather has in place of what is outside of the array; keys have none."""
     aval: Any = equation.outvars[0].aval
     if jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key):
         raise Unsupported("a key of random numbers in place of one that is not there")

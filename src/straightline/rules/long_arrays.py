@@ -37,7 +37,7 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Return whether nodes for all entries of an argument would be too many.
+    """Return whether nodes (one operation each) for all entries of an argument would be too many.
 
     More than LOADED numbers in memory always are. More than TABLE are, unless all arrays in memory are tables of
     constants and the other arguments are as many nodes, or what is left to compute is known or, as in q I, of few
@@ -56,10 +56,10 @@ def _is_table(x: Value) -> bool:
 
 
 def _are_written_out(inputs: list[Value], count: int) -> bool:
-    """Return whether a result of tables and other arrays is written out as nodes.
+    """Return whether a result of `count` entries, of tables (constants in memory) and arrays of nodes, is written out.
 
-    So it is where one of these is as many nodes already, where all are known, or where there are but single numbers
-    beside tables of few entries that are not zero.
+    So it is where one of the arrays is as many nodes already, where all are known, or where there are but single
+    numbers beside tables with at most TABLE entries that are not zero.
     """
     arrays = [x for x in inputs if not isinstance(x, StridedArray)]
     tables = [x for x in inputs if isinstance(x, StridedArray)]
@@ -73,7 +73,10 @@ def _make_row_by_row_rule(name: str) -> Rule:
     """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
 
     def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Lower the operation on arrays of the result's shape, or of fewer axes, or of one row."""
+        """Lower an operation of entries (`name`): of long arrays one row of the result after another, in a loop.
+
+        Arrays have the result's shape, or fewer axes, or one row.
+        """
         shape, ndim = result_shape(equation), max(len(x.shape) for x in inputs)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
@@ -94,13 +97,16 @@ def _make_row_by_row_rule(name: str) -> Rule:
 def load_as_nodes(
     lowering: Lowering, results: tuple[list[Value], list[Value]]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the carried and the stacked arrays of a turn as nodes, loaded where they are in memory."""
+    """Return the carried and the stacked arrays of a loop's turn as nodes, loaded where they are in memory."""
     carried, stacked = results
     return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
 
 
 def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> Value:
-    """Return the part of an argument that a row of the result needs: its only row, or all where it has fewer axes."""
+    """Return the part of an argument that a row of the result, of `ndim` axes, needs: that row, its only row, or all.
+
+    All of it where it has fewer axes than the result. The `row` is a node, a loop's counter.
+    """
     if x.ndim < ndim:
         return x
     if isinstance(x, StridedArray):
@@ -109,7 +115,7 @@ def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> 
 
 
 def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
-    """Return the same operation for one row."""
+    """Return the same operation for one row: what looks like it to a rule, with results that lack the first axis."""
     avals: list[Any] = [v.aval for v in equation.outvars]
     rows = [SimpleNamespace(aval=make_placeholder(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
@@ -176,7 +182,10 @@ def _find_free_axis(x: StridedArray, contracted: Sequence[int]) -> int | None:
 
 
 def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
-    """Return a product of arrays of nodes: written out, or of many terms by a loop over rows in memory."""
+    """Return a product of arrays of nodes: written out, or with more than MANY_TERMS terms in a loop over rows.
+
+    Of several matrices (batch), or of a sum over several axes, it is always written out.
+    """
     (left, right), (batch, _) = equation.params["dimension_numbers"]
     if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
         return write_product(lowering, equation, inputs)
@@ -184,7 +193,10 @@ def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 
 
 def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
-    """Count the terms of all sums over an axis of a and one of b, without those that a known zero leaves out."""
+    """Return how many terms the sums over axis `left` of a and `right` of b have, without those with a known zero.
+
+    0 stands for few enough, which is known without counting.
+    """
     if a.size * b.size <= MANY_TERMS * a.shape[left]:  # few enough with all zeros: no need to count them
         return 0
     # At each place along the axis, each entry of a that is no known zero meets each such entry of b.
@@ -192,7 +204,7 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
 
 
 def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
-    """Count the entries that are no known zero, for each place along an axis."""
+    """Return for each place along an axis how many entries there are no known zero."""
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
     return counts
@@ -203,7 +215,7 @@ def _accumulate_turns(lowering: Lowering, equation: JaxprEqn, count: int, turn: 
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the sum so far with this turn's number, and nothing to stack."""
+        """Return the sum so far with the number of this turn (`turn`), as the carry, and nothing to stack."""
         _no_carry, stacked = turn(row, [])
         pair = np.stack([carry[0], *stacked])
         return [np.asarray(RULES["reduce_sum"](lowering, sum_along_first, [pair])[0])], []
@@ -251,7 +263,7 @@ def _write_out_product(
 
 
 def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int, Node]:
-    """Return the entries of a row that are no known zeros, by their places."""
+    """Return the nodes of a row's entries that are no known zeros, by their places; a row of numbers as constants."""
     if row.dtype != object:
         return {int(k): graph.constant(row[k].item(), type) for k in np.flatnonzero(row)}
     return {k: n for k, n in enumerate(row.tolist()) if n.op != "constant" or n.value}
@@ -272,7 +284,7 @@ def _make_reduction_rule(name: str) -> Rule:
     """Return the rule of a reduction, such as `reduce_sum`: of short arrays at once, of long ones row by row."""
 
     def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Lower the reduction of one array along the axes of the operation."""
+        """Lower the reduction (`name`) of one array along the operation's axes: at once, of a long one row by row."""
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
         return _reduce_long(lowering, equation, name, inputs[0])

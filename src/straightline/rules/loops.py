@@ -23,12 +23,13 @@ def repeat_turns(
 ) -> tuple[list[np.ndarray], list[StridedArray]]:
     """Repeat `turn` for `length` turns; return the carry after them, and the stacked results in memory.
 
-    turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or down to 0.
+    turn(row, carry) returns the next carry, and what is stacked in that row; rows run from 0 up, or `backwards` down to
+    0. `carry` has the arrays of nodes that a turn hands to the next.
     """
     graph, outer = lowering.graph, lowering.graph.current
 
     def body(loop: Loop, carry: list[np.ndarray]) -> tuple[Sequence[np.ndarray], list[StridedArray]]:
-        """Return the next carry, and the memory in which each turn stores a row."""
+        """Return the next carry, and the memory (length, ...), around the loop, in which each turn stores a row."""
         loop.counter = counter = graph.make_fresh_node("counter", "i64", (), loop.body, loop)
         row = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
         following, stacked = turn(row, carry)
@@ -96,9 +97,9 @@ def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list
 def _store_row(
     lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
 ) -> StridedArray:
-    """Store one turn's array as one row of memory; return the array (length, ...) of all turns.
+    """Store one turn's array as one row of memory in the block `outer`; return the array (length, ...) of all turns.
 
-    The row's number is that of the turn, `counter`, or counted from the last row back.
+    The row's number is that of the turn, `counter`, or, `backwards`, counted from the last row back.
     """
     flat = _list_nodes_of_numbers(value)
     type: Type = flat[0].type if flat else "f64"
@@ -113,7 +114,7 @@ def _store_row(
 
 
 def _list_nodes_of_numbers(value: np.ndarray) -> list[Node]:
-    """Return the nodes of an array in order; raise if they are keys of random numbers."""
+    """Return the nodes of an array in row-major order; raise Unsupported if they are keys of random numbers."""
     flat: list[Node] = value.ravel().tolist()
     if any(isinstance(x, RandomKey) for x in flat):
         raise Unsupported("keys of random numbers in memory")
@@ -153,7 +154,8 @@ def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Lower `scan`: written out if it is short, else as a loop; return its carry, then what it stacks.
 
-    The arguments of a scan are constants, the carry, and arrays of which each turn gets a row.
+    The arguments of a scan are constants, the carry, and arrays of which each turn gets a row. Short: all turns compute
+    no more than `written_out` numbers, by an estimate.
     """
     params = equation.params
     (consts, carried), length = _count_scan_arguments(params), params["length"]
@@ -181,7 +183,10 @@ def _lower_long_scan(
     rows = [put_in_memory(lowering, x) for x in rows]
 
     def lower_turn(row: Node, numbers: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Lower the body for one row of the stacked arguments; return the carried numbers, and what is stacked."""
+        """Lower the body for one row of the stacked arguments; return the carried arrays as nodes, and what is stacked.
+
+        Of the `count` carried arrays those in `in_memory` are read and filled there, `as_numbers` are nodes.
+        """
         arrays: dict[int, Value] = dict(zip(as_numbers, numbers, strict=True))
         arrays |= {k: x.view_in_turn() for k, x in in_memory.items()}
         whole_carry = [arrays.get(k, carry[k]) for k in range(count)]
@@ -204,6 +209,7 @@ class CarriedMemory:
     """
 
     def __init__(self, lowering: Lowering, start: Value):
+        """Make memory for an array that a loop carries, with `start` copied into it before the first turn."""
         self._graph = lowering.graph
         self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
         self.memory.kind = "carried"
@@ -240,7 +246,10 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
 
 
 def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
-    """Return how many arguments of a scan are constants, and how many are carried: numbers in JAX 0.10, trees later."""
+    """Return how many arguments of a scan are constants, and how many are carried.
+
+    JAX 0.10 has these counts among the parameters; later ones have trees, whose entries are counted.
+    """
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     consts, carried, _ = params["ft_in"].unpack()
@@ -303,7 +312,10 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
 
     def body(loop: Loop, carry: list[np.ndarray]) -> tuple[list[np.ndarray], None]:
-        """Write the check, then the body; return the next carry, selected by each run's condition."""
+        """Write the check, then the body; return the next carry, selected by each run's condition, and nothing stacked.
+
+        The loop goes on while any run's condition holds; a run whose own does not keeps its numbers.
+        """
         active = lowering.nodes(lowering.inline_program(params["cond_jaxpr"], [*of_condition, *carry])[0])
         loop.condition = reduce(lambda a, b: graph.node("or", "bool", a, b), list_nodes(active))
         loop.body.items.append(LoopExit(loop))
@@ -314,14 +326,17 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """Return new entries where a loop goes on, and the old ones elsewhere."""
+    """Return new entries where a loop goes on (`active`), and the old ones elsewhere.
+
+    `active` has a flag for each item of a batch, along leading axes: it is repeated for the item's entries.
+    """
     conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
     entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)
     return arrange_nodes([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
 
 
 def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
-    """Estimate the count of numbers that a traced program computes: a scan's body once a turn, a while loop's once."""
+    """Return about how many numbers a traced program computes: a scan's body in each turn, a while loop's once."""
     if jaxpr in lowering.sizes:
         return lowering.sizes[jaxpr]
     total = 0

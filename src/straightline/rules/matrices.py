@@ -15,17 +15,17 @@ from straightline.nodes import REAL, Node, Type, Unsupported
 
 
 def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
-    """Combine nodes one by one; return `empty` if there are none."""
+    """Return the node of n_0 op n_1 op n_2 ..., from the left; the constant `empty` if there are no nodes."""
     if not nodes:
         return graph.constant(empty, type)
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
 
 
 def _make_reduction_rule(op: str, empty: float) -> Rule:
-    """Return the rule that reduces along axes by `op`; over nothing the result is `empty`."""
+    """Return the rule of an operation that reduces an array along axes by `op`; of no entries the result is `empty`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array reduced along the axes of the operation."""
+        """Return the array reduced by `op` along the axes of the operation; `empty` is the result of no entries."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # A row of terms for each entry of the result; a sum over nothing has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
@@ -42,7 +42,7 @@ ALL_BITS = np.nan
 
 
 def _replace_not_finite(type: Type, number: float) -> float:
-    """Return a neutral element as a number of a type: of integers and flags the limits stand for infinities.
+    """Return a reduction's result of no entries as a number of a type: integers and flags have limits for infinities.
 
     Infinity becomes the greatest number of the type, minus infinity the least, and ALL_BITS the one with all bits set.
     Finite numbers, and all numbers of a real type, are as they were.
@@ -62,7 +62,7 @@ def _make_accumulation_rule(op: str) -> Rule:
     """Return the rule that accumulates along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array with each entry combined with all before it along the axis, or all behind it in reverse."""
+        """Return the array with each entry combined (`op`) with all before it along the axis; in reverse, behind it."""
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
@@ -83,7 +83,7 @@ def _make_extreme_index_rule(op: str) -> Rule:
     """Return the rule of `argmax` (op "gt") or `argmin` ("lt"): along one axis, with the result's other axes."""
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the index along the axis for each of the other entries."""
+        """Return the index of the greatest (`op` "gt") or least ("lt") entry along the axis, by the other axes."""
         axis = equation.params["axes"][0]
         x = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in x.tolist()]
@@ -110,7 +110,10 @@ def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> N
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Write `dot_general` out: for each batch the products A B' of A (free, contracted) and B (free, contracted)."""
+    """Write `dot_general` out: for each place on the batch axes a product A B', entry by entry.
+
+    A and B are (free, contracted): the contracted axes are summed over, the free ones are the result's.
+    """
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     type = result_type(equation)
     x, y = (_convert(lowering.graph, type, x) for x in inputs)
@@ -164,7 +167,7 @@ def _is_zero_term(x: Node, y: Node) -> bool:
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B diag(w): in each column all entries of A are those of B times the same node."""
+    """Return whether A = B diag(w), for arrays of nodes: in each column A's entries are B's times the same node."""
     if a.shape != b.shape:
         return False
     weights = [[_find_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
@@ -172,7 +175,7 @@ def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _find_weight(x: Node, y: Node) -> Node | None:
-    """Return w of a number x that was computed as w y, None of any other."""
+    """Return the node w of a number x that was computed as w y, None of any other; x itself where y is 1."""
     if y.op == "constant" and y.value == 1:
         return x
     if x.op != "mul" or not any(factor is y for factor in x.args):
@@ -203,16 +206,20 @@ def _convert(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
 
 
 def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-    """Return an array as (batch, free, contracted), each of one axis."""
+    """Return an array as (batch, free, contracted), each of one axis: the free ones are in neither list of axes."""
     free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
     sizes = [math.prod(x.shape[d] for d in axes) for axes in (batch, free, contracted)]
     return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
 
 
 def _for_each_matrix(function: Any) -> Rule:
-    """Return a rule of the last two axes: function(graph, parameters, *matrices) for each index of the others."""
+    """Return the rule of an operation on matrices, the last two axes: function(graph, parameters, *matrices).
+
+    It is called for each place on the other axes.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return what `function` makes of the matrices at each place on the axes before the last two, one by one."""
         flat = [x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:]) for x in inputs]
         items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
         return [arrange_nodes((x for item in items for x in item.ravel().tolist()), result_shape(equation))]

@@ -22,7 +22,7 @@ _present: Any = Primitive("present")
 def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*shape"]:
     """Return the same numbers, marked as never NaN: `jnp.isnan` of them is known to be false when code is made.
 
-    So the branch for a missing number costs nothing where none is ever missing. XLA ignores the mark.
+    So the branch for a missing number (NaN) costs nothing where none is ever missing. XLA ignores the mark.
 
     Args:
         x: numbers that the caller knows to be there.

@@ -27,7 +27,10 @@ PARITY = 0x1BD11BDA
 
 
 def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
-    """Hash a counter's two words, the first word above the second; a constant if all words are."""
+    """Return the node of a hash of 64 bits, of a counter's two words (32 bits each) by a key; a constant if known.
+
+    Its first word is in the upper bits, the second in the lower.
+    """
     words = (key.first, key.second, high, low)
     if all(word.op == "constant" for word in words):
         return graph.constant(hash_words(*(int(word.value) for word in words)), "u64")
@@ -35,7 +38,7 @@ def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
 
 
 def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
-    """Return the hash of a counter's two words by a key, as a key."""
+    """Return the hash of a counter's two words by a key, as a new key: of its upper and lower 32 bits."""
     both = threefry(graph, key, high, low)
     shifted = graph.node("shift_right", "u64", both, graph.constant(32, "u64"))
     return RandomKey(graph.node("convert", "u32", shifted), graph.node("convert", "u32", both))
@@ -48,14 +51,14 @@ def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 
 
 def _read_key_words(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the words (..., 2) of keys (...)."""
+    """Return the two words of each key of random numbers: an array (..., 2) of nodes from keys (...)."""
     _check_key_type(equation.invars[0])
     words = [word for key in inputs[0].ravel().tolist() for word in (key.first, key.second)]
     return [arrange_nodes(words, result_shape(equation))]
 
 
 def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the key that is the hash of (0, number)."""
+    """Return for each key and number the key that is the hash, by the key, of the words (0, number)."""
     _check_key_type(equation.invars[0])
     shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
     pairs = zip(*broadcast_entries(inputs, shape), strict=True)
@@ -63,7 +66,7 @@ def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key the keys that are the hashes of 0, 1, 2, ..."""
+    """Return for each key the new keys that are the hashes, by it, of 0, 1, 2, ..., as many as the shape asks for."""
     _check_key_type(equation.invars[0])
     graph, counters = lowering.graph, _make_counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
@@ -71,7 +74,7 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key the hashes of 0, 1, 2, ...; 32 bits are the exclusive or of both words."""
+    """Return for each key random bits: the hashes of 0, 1, 2, ... by it; of 32 bits the exclusive or of both halves."""
     _check_key_type(equation.invars[0])
     graph, width = lowering.graph, equation.params["bit_width"]
     counters = _make_counters(graph, equation.params["shape"])
@@ -86,12 +89,12 @@ def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the key whose words are those of the number."""
+    """Return for each number (a seed) the key whose two words are the upper and lower 32 bits of it."""
     _check_key_type(equation.outvars[0])
     graph = lowering.graph
 
     def words(number: Node) -> RandomKey:
-        """Return the key of a number: its high word, 0 of one of 32 bits, and its low word."""
+        """Return the key of a number: its upper 32 bits, 0 for a type of 32 bits, and its lower ones."""
         if number.type[1:] == "32":
             return RandomKey(graph.constant(0, "u32"), graph.node("convert", "u32", number))
         whole = graph.node("convert", "u64", number)
@@ -102,7 +105,7 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Hash words (...) with Threefry; return both words of each pair."""
+    """Return both words of the hashes (Threefry) of counters' word pairs by keys, in two arrays, as JAX does."""
     shape = result_shape(equation)
     items = zip(*broadcast_entries(inputs, shape), strict=True)
     keys = [_new_key(lowering.graph, RandomKey(first, second), high, low) for first, second, high, low in items]
@@ -110,7 +113,7 @@ def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nda
 
 
 def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
-    """Lower JAX's program for gamma variables, a loop until a proposal is accepted."""
+    """Lower random gamma variables by JAX's own program for them, a loop until a proposal is accepted."""
     gamma: Any = equation.primitive.impl
     avals: list[Any] = [v.aval for v in equation.invars]
     program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
@@ -123,14 +126,17 @@ def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray
 
 
 def _make_counters(graph: Graph, shape: tuple[int, ...]) -> list[tuple[Node, Node]]:
-    """Return 0, 1, 2, ... as two words each; hashes of so many that no program would hold them are refused at once."""
+    """Return 0, 1, 2, ... as two words (upper, lower) each, one for each place of a shape; refuse more than LOADED.
+
+    Hashes of so many would be in no program, and take long to refuse one by one.
+    """
     if math.prod(shape) > LOADED:
         raise Unsupported(f"{math.prod(shape):,} random numbers at once")
     return [(graph.constant(i >> 32, "u32"), graph.constant(i & 0xFFFFFFFF, "u32")) for i in range(math.prod(shape))]
 
 
 def _check_key_type(variable: Any) -> None:
-    """Raise unless keys are of JAX's default hash, counted as its newer releases do."""
+    """Raise Unsupported unless keys are of JAX's default hash, with the counters of jax_threefry_partitionable."""
     if str(variable.aval.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {variable.aval.dtype}")
     if not jax.threefry_partitionable.value:
@@ -147,7 +153,8 @@ RULES |= {
 def hash_words(first: Word, second: Word, high: Word, low: Word) -> Word:
     """Return the hash, of 64 bits, of a counter's words by a key's: Threefry of two words of 32 bits.
 
-    20 rounds of addition, rotation and exclusive or; key words are added every four rounds.
+    20 rounds of addition, rotation (ROTATIONS: by how many bits) and exclusive or; key words are added every four
+    rounds. PARITY, a constant of Threefry's definition, makes the third key word.
     """
     keys = (first, second, first ^ second ^ PARITY)
     mask = 0xFFFFFFFF  # keeps the lower 32 bits of a sum

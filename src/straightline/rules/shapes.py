@@ -14,7 +14,10 @@ from straightline.size_limits import FEW
 
 
 def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]], np.ndarray]) -> Rule:
-    """Make a rule of one array: function(array, parameters, shape of the result)."""
+    """Return the rule of an operation that only moves the nodes of one array, by function(array, parameters, shape).
+
+    The shape is that of the result.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         return [function(inputs[0], equation.params, result_shape(equation))]
@@ -23,7 +26,7 @@ def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]]
 
 
 def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Place the axes of an array among those of a shape, and repeat it along the others."""
+    """Return an array repeated to a shape, in which its own axes have the places `broadcast_dimensions`."""
     placed = [1] * len(shape)
     for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
         placed[axis] = size
@@ -59,7 +62,7 @@ def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `pad`: entries go to their places in an array of the filling; negative padding cuts them off."""
+    """Lower `pad`: return an array of the filling with x's entries in their places; negative padding cuts some off."""
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
@@ -75,7 +78,7 @@ def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray])
 
 
 def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
-    """Return 0, 1, 2, ... along one axis, the same along the others."""
+    """Return the constant array that is 0, 1, 2, ... along one axis, and the same along the others."""
     shape, axis = result_shape(equation), equation.params["dimension"]
     numbers = np.arange(shape[axis]).astype(equation.params["dtype"])
     along_axis = numbers.reshape([-1 if d == axis else 1 for d in range(len(shape))])
@@ -88,7 +91,7 @@ def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nd
 
 
 def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
-    """Return one of several arrays, the first for numbers below 0 and the last for numbers beyond."""
+    """Return the array among `cases` whose number is `which`, the first below 0 and the last beyond, by selections."""
     # From the last case back, each is chosen where `which` is at most its number, over those behind it.
     selected = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
@@ -99,7 +102,7 @@ def select_array(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarr
 
 
 def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `dynamic_update_slice`: at known starts a copy, at one that data decide a choice among its few places."""
+    """Lower `dynamic_update_slice`: x with `update` put at its starts, of which data may decide one of few places."""
     x, update, starts = inputs[0], inputs[1], [lowering.get_only_node(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last_start = x.shape[axis] - update.shape[axis]
@@ -115,7 +118,10 @@ def _lower_dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: 
 def _update_at(
     lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
 ) -> np.ndarray:
-    """Return x with `update` put at these starts; along the one axis whose start is None, at `here`."""
+    """Return x with `update` put at these starts, one for each axis; along the one whose start is None, at `here`.
+
+    Along any other axis a start must be known, or the update as long as x, so that there is one place.
+    """
     ranges = []
     for size, length, start in zip(update.shape, x.shape, starts, strict=True):
         has_one_place = length == size

@@ -31,7 +31,7 @@ def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _is_behind(graph: Graph, a: Node, b: Node) -> Node:
-    """Return whether a belongs behind b."""
+    """Return the node of whether a belongs behind b in ascending order: a > b, or a is NaN and b is none."""
     larger = graph.node("gt", "bool", a, b)
     if a.type not in REAL:
         return larger

@@ -75,7 +75,7 @@ def _sum_lower_series(a: jax.Array, x: jax.Array, skipped: jax.Array) -> jax.Arr
     """
 
     def add_term(state: SeriesState) -> SeriesState:
-        """Add the next term, the last one times x / (a + n); `state.step` is a + n."""
+        """Add the next term of the series, the last one times x over the next denominator, a + 1, a + 2, ..."""
         denominator, term, total = state
         term = term * x / (denominator + 1)
         return SeriesState(denominator + 1, term, total + term)
@@ -98,7 +98,10 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
     """
 
     def continue_fraction(state: ContinuedFraction) -> ContinuedFraction:
-        """Add the next level: partial numerator n (a - n) over x + 2 n + 1 - a."""
+        """Add level n of the continued fraction: partial numerator n (a - n) over x + 2 n + 1 - a.
+
+        By Lentz's method: the fraction is a product of ratios c d, and ends where the last one is 1.
+        """
         n, c, d, fraction, _ = state
         numerator, b = n * (a - n), x + 2 * n + 1 - a
         c, d = b + numerator / c, 1 / _replace_zero_by_tiny(b + numerator * d)
@@ -187,7 +190,10 @@ def scaled_bessel(order: int, x: jax.Array) -> jax.Array:
     is_far = size > FAR
 
     def add_term(state: SeriesState) -> SeriesState:
-        """Add term k of the series that serves: the last term times a ratio."""
+        """Add term k of the series that serves, the last term times a ratio: where `is_far` the asymptotic one.
+
+        The other is the power series; `size` is the argument of the Bessel function, `order` its order.
+        """
         k, term, total = state
         power_ratio = size * size / (4 * k * (k + order))
         asymptotic_ratio = ((2 * k - 1) ** 2 - 4 * order**2) / (8 * k * jnp.where(is_far, size, 1.0))
@@ -241,7 +247,10 @@ def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -
 def _inline_in_double(
     function: Callable[..., Any], lowering: Lowering, equation: JaxprEqn, inputs: list[Value]
 ) -> list[Value]:
-    """Return the results of a function of scalars over arrays, computed in double precision of either."""
+    """Return the results of a function of scalars for each entry of arrays, computed in double precision.
+
+    The arguments' type may be double or float, to which results are converted back.
+    """
     avals: list[Any] = [v.aval for v in equation.invars]
     if avals[0].dtype not in (np.float64, np.float32):
         raise Unsupported(f"{equation.primitive.name} of numbers of type {avals[0].dtype}")
@@ -258,7 +267,7 @@ def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
 
 @cache
 def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the program of a function of `count` scalars over arrays of a shape."""
+    """Return the program of a function of `count` scalars for each entry of arrays of a shape, in double precision."""
     over_arrays = function
     for _ in shape:
         over_arrays = jax.vmap(over_arrays)

@@ -20,7 +20,10 @@ View = Callable[[StridedArray, Any, tuple[int, ...]], StridedArray | None]
 
 
 def _make_view_rule(name: str, view: View) -> Rule:
-    """Return a rule of one array: its view, or the rearranged nodes if there is none."""
+    """Return the rule of an operation on an array in memory: its view(array, parameters, shape), which copies nothing.
+
+    Where no strides describe that, and it is None, nodes are loaded and rearranged by the operation's rule for nodes.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         viewed = view(inputs[0], equation.params, result_shape(equation))
@@ -30,14 +33,15 @@ def _make_view_rule(name: str, view: View) -> Rule:
 
 
 def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return a view from start to limit along each axis, by steps."""
+    """Return the view that `slice` takes of an array in memory: from start to limit along each axis, by steps."""
     steps = params["strides"] or (1,) * x.ndim
     offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
     return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
 
 
 def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return a view that goes backwards along some axes."""
+    """Return the view of an array in memory that goes backwards along some axes."""
+    # From the last entry of each such axis, by negative strides.
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
     return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
@@ -54,7 +58,7 @@ def _reshape(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArr
 
 
 def _broadcast_view(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return a view that repeats an array in memory along new axes: strides of zero."""
+    """Return the view that repeats an array in memory along new axes, and axes of length 1, by strides of zero."""
     strides = [0] * len(shape)
     for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
         strides[axis] = 0 if size == 1 else stride
@@ -62,7 +66,7 @@ def _broadcast_view(x: StridedArray, params: Any, shape: tuple[int, ...]) -> Str
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return views of an array's parts along an axis."""
+    """Return views of the parts, of the operation's sizes, into which an array in memory is split along an axis."""
     x, axis, parts, start = inputs[0], equation.params["axis"], [], 0
     for size in equation.params["sizes"]:
         shape = [size if a == axis else n for a, n in enumerate(x.shape)]
@@ -99,7 +103,10 @@ def _dynamic_slice_of_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list
 
 
 def _slice_window(lowering: Lowering, x: np.ndarray, axis: int, start: Node, size: int) -> np.ndarray:
-    """Return `size` entries along an axis from a start that may depend on data."""
+    """Return `size` entries of an array of nodes along an axis, from a start that is clamped so that they are inside.
+
+    Where the start depends on data, they are selected among those of all starts.
+    """
     last_start: int = x.shape[axis] - size
     along_axis = [(slice(None),) * axis + (slice(first, first + size),) for first in range(last_start + 1)]
     cases: list[np.ndarray] = [x[window] for window in along_axis]
@@ -168,7 +175,7 @@ def _view_window(
 
 
 def _match_strides(view: StridedArray, shape: tuple[int, ...]) -> list[int]:
-    """Return strides of the same entries with axes of length 1 added."""
+    """Return the strides of a view in a shape that differs from its own by axes of length 1 alone: theirs are 0."""
     rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
     items = iter(rest)
     return [next(items) if n != 1 else 0 for n in shape]
@@ -195,7 +202,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> StridedArray:
-    """Return arrays one after another in one buffer of this shape, which is that of their concatenation.
+    """Return arrays one after another in one buffer of this shape, that of their concatenation along the first axis.
 
     An array that has a buffer of its own (`_is_whole_buffer`) is computed into it directly, all others are copied.
     """
@@ -219,7 +226,7 @@ def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
 
 
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
-    """Store an array into a buffer from a place on: entry by entry if short, else by a loop."""
+    """Store an array into a buffer from a place on: entry by entry up to TABLE entries or of nodes, else by a loop."""
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, StridedArray):
         for index, node in enumerate(lowering.nodes(x).ravel().tolist()):

@@ -59,7 +59,7 @@ def find_format(x: Vector) -> PrecisionFormat:
 
 
 def exp(x: Vector) -> Vector:
-    """Return e^x = 2^n e^r, r = x - n ln 2."""
+    """Return e^x = 2^n e^r, n the integer nearest to x / ln 2, r = x - n ln 2, e^r = 1 + r + r^2 times a polynomial."""
     form = find_format(x)
     count, n = round_to_nearest(x * LOG2_E)
     r = fma(n, -form.ln2[1], fma(n, -form.ln2[0], x))
@@ -69,7 +69,10 @@ def exp(x: Vector) -> Vector:
 
 
 def exp_of_sum(x: Vector, low: Vector) -> Vector:
-    """Return e^(x + low), |low| small against 1, within 0.6 units of rounding: 1 + r as a sum of two numbers."""
+    """Return e^(x + low), |low| small against 1, within 0.6 units of rounding.
+
+    As `exp`, but with r = x + low - n ln 2, and with 1 + r, as sums of two numbers: the second is what rounding loses.
+    """
     form = find_format(x)
     count, n = round_to_nearest(x * LOG2_E)
     first, rest = _reduce_argument(x, n)
@@ -83,7 +86,10 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
 
 
 def expm1(x: Vector) -> Vector:
-    """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels."""
+    """Return e^x - 1 = 2 (2^(n-1) (e^r - 1) + 2^(n-1) - 1/2), which neither overflows early nor cancels.
+
+    n is the integer nearest to x / ln 2, and r = x - n ln 2. Below -50 the result is -1 to the last digit, as at -50.
+    """
     form = find_format(x)
     count, n = round_to_nearest(select(x < -50.0, -50.0, x) * LOG2_E)
     r, low = _reduce_argument(select(x < -50.0, -50.0, x), n)
@@ -95,7 +101,7 @@ def expm1(x: Vector) -> Vector:
 
 
 def log(x: Vector) -> Vector:
-    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2)."""
+    """Return log(2^k m) = k ln 2 + log m, m between sqrt(1/2) and sqrt(2); -infinity of 0, NaN below."""
     # A subnormal x is made a normal number by a power of two, which is taken off its exponent.
     form = find_format(x)
     is_subnormal, power = x < form.tiny, form.fraction + 2
@@ -105,7 +111,8 @@ def log(x: Vector) -> Vector:
 
 
 def log1p(x: Vector) -> Vector:
-    """Return log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded."""
+    """Return log(1 + x) = log(u) + log((1 + x) / u), u = 1 + x as rounded; x itself where it is negligible."""
+    # The second logarithm is nearly what rounding took from 1 + x, over u.
     u = 1 + x
     rounded = select(abs(x) < 1.0, x - (u - 1), 1 - (u - x))
     k, m = _split_exponent(u)
@@ -114,7 +121,10 @@ def log1p(x: Vector) -> Vector:
 
 
 def tanh(x: Vector) -> Vector:
-    """Return -t / (2 + t), t = e^(-2|x|) - 1; beyond 1/2, 1 - 2 / (2 + t), t = e^(2|x|) - 1."""
+    """Return the hyperbolic tangent, with the sign of x, of |x|: -t / (2 + t), t = e^(-2|x|) - 1.
+
+    Beyond 1/2 it is 1 - 2 / (2 + t), t = e^(2|x|) - 1: each form is precise where it is used.
+    """
     size = abs(x)
     large = size > 0.5
     t = expm1(select(large, 2 * size, -2 * size))
@@ -133,7 +143,7 @@ def round_to_nearest(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
-    """Return x - n ln 2 as the sum of two numbers."""
+    """Return x - n ln 2 as the sum of two numbers, the second what rounding takes from the first; ln 2 is a sum too."""
     high, low = find_format(x).ln2
     first = fma(n, -high, x)
     rest = n * low
@@ -170,7 +180,10 @@ def _split_exponent(x: Vector) -> tuple[Vector, Vector]:
 
 
 def _log(k: Vector, f: Vector, more: Vector | float) -> Vector:
-    """Return K ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero."""
+    """Return k ln 2 + log(1 + f) + more, where `more` is small against the rest or the rest is zero.
+
+    log(1 + f) = f - f^2 / 2 + s (f^2 / 2 + r), s = f / (2 + f), r a polynomial in s^2; ln 2 is a sum of two numbers.
+    """
     form = find_format(f)
     s = f / (2 + f)
     z = s * s

@@ -26,13 +26,13 @@ class FormulaBody:
         return f"%{scalar}"
 
     def add(self, scalar: str, operation: str) -> "Vector":
-        """Append an operation; return its result, a vector of these scalars."""
+        """Append an operation in LLVM's text; return its result, a vector of the type `scalar`."""
         name = f"%t{len(self.lines)}"
         self.lines.append(f"{name} = {operation}")
         return Vector(self, scalar, name)
 
     def compute_where_needed(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
-        """Return what `costly` returns where it is needed, else the value.
+        """Return what `costly` returns in the lanes where it is `needed`, else the value.
 
         `costly` writes its operations as it is called, within a block that is jumped past if no lane needs it.
         """
@@ -60,7 +60,7 @@ def _make_operator(real: str, whole: str, turned: bool = False) -> Callable[["Ve
     """
 
     def apply(self: "Vector", other: Operand) -> "Vector":
-        """Return self op other, or other op self."""
+        """Return self op other, `turned` other op self: by the instruction `real` of real vectors, else `whole`."""
         pair = (self, self.like(other))
         a, b = reversed(pair) if turned else pair
         return self.body.add(self.scalar, f"{real if self.scalar in REALS else whole} {self.type} {a.name}, {b.name}")
@@ -69,10 +69,10 @@ def _make_operator(real: str, whole: str, turned: bool = False) -> Callable[["Ve
 
 
 def _make_comparison(real: str, whole: str) -> Callable[["Vector", Operand], "Vector"]:
-    """Return the method that compares vectors, of reals or of whole numbers."""
+    """Return the method that compares vectors: by LLVM's condition `real` on real numbers, `whole` on all others."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
-        """Return the truth values of self op other."""
+        """Return the truth values, lane by lane, of self op other: the condition `real` of real ones, else `whole`."""
         how = f"fcmp {real}" if self.scalar in REALS else f"icmp {whole}"
         return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
 
@@ -129,7 +129,7 @@ def rounded(value: float) -> float:
 
 
 def make_constant(body: FormulaBody, scalar: str, value: float) -> Vector:
-    """Return a vector of one number."""
+    """Return a vector with one number in all lanes, as LLVM's literal: a real one by its bits as a double."""
     if scalar in REALS:
         value = value if scalar == "double" else rounded(value)
         text = "0x" + struct.pack(">d", value).hex().upper()
@@ -141,7 +141,10 @@ def make_constant(body: FormulaBody, scalar: str, value: float) -> Vector:
 
 
 def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
-    """Select `yes` where the condition holds, else `no`; one of them is a vector, or both are real numbers."""
+    """Return `yes` in the lanes where the condition holds, else `no`; one of them is a vector, or both are numbers.
+
+    Of two numbers the result is a vector of doubles.
+    """
     body = condition.body
     model = next((v for v in (yes, no) if isinstance(v, Vector)), make_constant(body, "double", 0.0))
     a, b = model.like(yes), model.like(no)

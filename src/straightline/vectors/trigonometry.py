@@ -63,7 +63,11 @@ def sin(x: Vector) -> Vector:
 
 
 def cos(x: Vector) -> Vector:
-    """Return the cosine: the sine a quarter further."""
+    """Return the cosine: cosine or sine of what is left of x beyond the nearest multiple of pi / 2, with its sign.
+
+    It is the sine a quarter turn further: of an odd number of quarter turns it is the sine, of one or two, modulo four,
+    the sign is the other one.
+    """
     quarter, r, low = _reduce_to_quarter(x)
     value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
     value = select(((quarter + 1) & 2).equals(0), value, -value)
@@ -71,7 +75,10 @@ def cos(x: Vector) -> Vector:
 
 
 def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return the number of quarter turns in x, and the rest as a sum; the first difference is exact."""
+    """Return the number n of quarter turns in x, and the rest x - n pi / 2 as a sum of two numbers.
+
+    pi / 2 is a sum of three, taken off one by one; the first difference is exact.
+    """
     quarter, n = round_to_nearest(x * (2 / math.pi))
     parts = HALF_PI if x.scalar == "double" else HALF_PI_OF_FLOATS
     first = fma(n, -parts[0], x)
@@ -86,7 +93,7 @@ def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def _sin(x: Vector, low: Vector) -> Vector:
-    """Return sin(x + low), |x| <= pi / 4."""
+    """Return sin(x + low), |x| <= pi / 4 and `low` what x lacks: x + x^3 times a polynomial in x^2, and low's part."""
     z = x * x
     v = z * x
     r = polynomial(z, _select_coefficients(x, SIN)[1:])
@@ -94,7 +101,7 @@ def _sin(x: Vector, low: Vector) -> Vector:
 
 
 def _cos(x: Vector, low: Vector) -> Vector:
-    """Return cos(x + low), |x| <= pi / 4."""
+    """Return cos(x + low), |x| <= pi / 4, `low` what x lacks: 1 - x^2 / 2 + x^4 times a polynomial in x^2 - x low."""
     z = x * x
     half = 0.5 * z
     w = 1 - half
@@ -137,7 +144,10 @@ def _atan_of_positive(x: Vector) -> Vector:
 
 
 def atan2(y: Vector, x: Vector) -> Vector:
-    """Return the angle of (x, y) in (-pi, pi]."""
+    """Return the angle of the point (x, y), from -pi to pi, NaN if a coordinate is NaN.
+
+    That of |y / x|, taken from pi where x < 0, with the sign of y.
+    """
     ratio = abs(y / x)
     both = abs(x).equals(abs(y))
     # 0/0 and infinity/infinity: along an axis, or a diagonal.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 def pause_collector() -> Iterator[None]:
     """Stop the collector of reference cycles within the block or the decorated function; then start it if it ran.
 
-    It would look at all that lives again and again: a third of the time of importing JAX and of tracing a program.
+    It would look at all living objects again and again: a third of the time of importing JAX and of tracing a program.
     Threads may overlap: the one that found it on switches it on again, so that it never stays off.
     """
     was_on = gc.isenabled()

@@ -44,7 +44,10 @@ EXTRAS = {  # the extra that brings a package which the core does without
 
 
 def how_to_install(extra: str) -> str:
-    """Return a command that brings an extra to this Python, also from a clone, whose name no index knows."""
+    """Return a command that installs an extra (a set of optional packages) for this Python.
+
+    From a clone of the repository by its folder, since no index may have it.
+    """
     clone = Path(heliograph.__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "heliograph"
     return f'{sys.executable} -m pip install "{package}[{extra}]"'
@@ -55,7 +58,10 @@ class MissingPackagesError(ModuleNotFoundError):
 
 
 def check_installed(packages: Iterable[str]) -> None:
-    """Raise MissingPackagesError where some of these packages of extras are not installed."""
+    """Raise MissingPackagesError, with the command to install them, where some of these packages are not installed.
+
+    EXTRAS has, for a package that heliograph uses but does not require, the extra that brings it.
+    """
     missing = [name for name in dict.fromkeys(packages) if find_spec(name) is None]
     if missing:
         extras = ",".join(sorted({EXTRAS[name] for name in missing if name in EXTRAS}))

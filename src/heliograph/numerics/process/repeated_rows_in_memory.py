@@ -26,6 +26,8 @@ _held: "WeakSet[mmap.mmap]" = WeakSet()  # memory of the arrays that live, count
 def repeat_row(row: np.ndarray, count: int) -> np.ndarray:
     """Return an array (count, ...) of equal rows, to be read and written as any other.
 
+    One of LEAST bytes or more is, where the system can, the same memory mapped again and again, until it is written.
+
     Args:
         row: the row (...).
         count: how many there are.
@@ -72,7 +74,7 @@ def _map_rows(row: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def _fill_file(file: int, size: int, row: np.ndarray) -> None:
-    """Fill so many bytes of a file with copies of a row."""
+    """Fill a file (by its descriptor), made `size` bytes large, with copies of a row, of which it holds whole ones."""
     os.ftruncate(file, size)
     with mmap.mmap(file, size) as memory:
         values: np.ndarray = np.frombuffer(memory, row.dtype).reshape(-1, *row.shape)
@@ -85,7 +87,10 @@ MAP_FIXED = 0x10  # of Linux: at this address, in the place of what is mapped th
 
 @cache
 def _find_system_call() -> Any:
-    """Return mmap(address, length, protection, flags, file, offset) of the system; None where it is not Linux's."""
+    """Return the system's function that shows a file's bytes in memory; None where the system is not Linux.
+
+    It is mmap(address, length, protection, flags, file, offset).
+    """
     if not hasattr(os, "memfd_create"):
         return None
     call = ctypes.CDLL(None, use_errno=True).mmap

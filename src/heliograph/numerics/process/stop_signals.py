@@ -23,7 +23,10 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
     """
 
     def handle_or_wait(number: int, frame: FrameType | None) -> None:
-        """Pass a signal to the handler, or raise it again soon while a module in C is imported."""
+        """Pass a signal to the handler, or raise it again soon (in SOON seconds) while a module in C is imported.
+
+        An exception from the handler would leave that half initialised.
+        """
         if _is_loading_c_module(frame):
             timer = Timer(SOON, interrupt_main, (number,))
             timer.daemon = True
@@ -43,7 +46,10 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
 
 
 def _is_loading_c_module(frame: FrameType | None) -> bool:
-    """Return whether a module in C is being loaded, which an exception would leave half initialised."""
+    """Return whether a module in C is being loaded, which an exception would leave half initialised.
+
+    Then one of the frames from this one outwards is that of its loader, in the file IMPORTS.
+    """
     while frame is not None:
         if frame.f_code.co_filename == IMPORTS and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
             return True
@@ -53,7 +59,7 @@ def _is_loading_c_module(frame: FrameType | None) -> bool:
 
 @contextmanager
 def hold_signals() -> Iterator[None]:
-    """Let no signal to stop part what the block does: the first one that comes is raised again at its end.
+    """Let no signal to stop (Ctrl-C, SIGTERM) interrupt the block: the first one that comes is raised again at its end.
 
     Only the main thread is interrupted by signals; in others this does nothing.
     """

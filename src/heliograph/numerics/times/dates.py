@@ -47,10 +47,10 @@ def parse_dates(texts: Iterable[object], name: str) -> np.ndarray:
 
 
 def parse_moment(text: str, name: str) -> tuple[int, bool]:
-    """Return a date as nanoseconds since 1970 in UTC, and whether it has a zone; a month is its first day.
+    """Return a date as nanoseconds since 1970 in UTC, and whether the text has a time zone (else UTC is assumed).
 
-    So is a year or a quarter. A leap second (23:59:60 UTC at the end of a month) is the second after it, as clocks of
-    computers have it.
+    A month, a quarter or a year is its first day. A leap second (23:59:60 UTC at the end of a month) is the second
+    after it, as clocks of computers have it. `name` is for errors.
 
     Raises:
         ValueError: no date of ISO 8601, or one beyond what nanoseconds can say.
@@ -70,7 +70,9 @@ def parse_moment(text: str, name: str) -> tuple[int, bool]:
 
 
 def _match_date(text: str) -> tuple[re.Match[str], bool]:
-    """Return the parts of a date, and whether it is a leap second, which is read as the second before it.
+    """Return the match of a date's parts (day, zone, ...), and whether it is a leap second, read as the one before it.
+
+    Dates without marks between their numbers (BASIC) get them first.
 
     Raises:
         ValueError: no date of ISO 8601, or one of a year that nanoseconds cannot say.
@@ -115,7 +117,10 @@ def _format_offset(zone: str | None) -> str:
 
 
 def parse_instant(text: str) -> datetime:
-    """Return a date of ISO 8601 with its zone, to the microsecond; a ValueError without words if it has no zone."""
+    """Return a date of ISO 8601 with its zone, to the microsecond; raise a bare ValueError if it has no zone.
+
+    A leap second is returned in UTC.
+    """
     match, leap = _match_date(text)
     if match["zone"] is None:
         raise ValueError
@@ -129,7 +134,7 @@ def parse_instant(text: str) -> datetime:
 def seconds_between(time: np.ndarray) -> np.ndarray:
     """Return the time since the row before, 0 in the first row: seconds between dates, else in the numbers' unit.
 
-    Dates are subtracted as whole nanoseconds, since in double precision they are known to some hundreds of these.
+    Dates are subtracted as whole nanoseconds: as doubles, those since 1970 are exact to some hundreds only.
     """
     if time.dtype.kind != "M":
         return np.diff(time, prepend=time[:1])
@@ -144,7 +149,8 @@ SPANS = {"years": 365.25 * 86400, "months": 30.4375 * 86400, "days": 86400.0, "h
 def unequal_steps(time: np.ndarray) -> str:
     """Return "steps of 1 and 21 years" where the longest step is more than LONGER times the median one, else "".
 
-    These are the median and the longest step, in the largest unit that the median nearly fills (of dates).
+    These are the median and the longest step, of dates in the largest unit (SPANS, in seconds) that the median nearly
+    fills; of numbers without one.
     """
     steps = seconds_between(time)[1:]
     # Not above LONGER times the shortest is not above that of the median: a look that saves the median's sort.
@@ -161,7 +167,10 @@ def unequal_steps(time: np.ndarray) -> str:
 
 
 def format_dates(time: np.ndarray) -> np.ndarray:
-    """Return the dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
+    """Return the dates as texts in UTC, all with as many digits of a second as one of them needs; "" for a missing one.
+
+    UNITS are the nanoseconds of each unit, the largest first.
+    """
     there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
     unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
     return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))
@@ -205,7 +214,7 @@ def horizons_in(text: str) -> int | list[float | np.timedelta64 | np.datetime64]
 
 
 def _parse_horizon(text: str) -> float | np.timedelta64 | np.datetime64:
-    """Return a horizon from its text: a span or a date, a whole number of steps, or seconds."""
+    """Return how far ahead a text says: a span (5s), a date, a whole number of steps, or seconds with a fraction."""
     if span := SPAN.fullmatch(text):
         return np.timedelta64(round(float(span["count"]) * NANOSECONDS[span["unit"]]), "ns")
     if looks_like_date(text):

@@ -46,7 +46,7 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 
 def _holds_texts_or_spans(value: object) -> bool:
-    """Test whether a value is of texts or spans of time; a list of unequal lists is not."""
+    """Test whether a value is of texts or spans of time, by NumPy's type of it; a list of unequal lists is not."""
     try:
         return np.asarray(value).dtype.kind in "mSU"
     except ValueError:
@@ -69,6 +69,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
         given = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
         whole = np.asarray(given)
         return _convert_unit(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
+    # Anything else that holds at least one date: all has to be dates then.
     parts = _list_elements(value)
     if not any(_is_date(part) for part in parts):
         return None
@@ -77,7 +78,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
 
 
 def _list_elements(value: object) -> list[Any]:
-    """Return what a list, or an array that is not of numbers, holds along its one axis; nothing of anything else."""
+    """Return what a list, or an array that is not of numbers, holds along its one axis; an empty list of all else."""
     kind = getattr(getattr(value, "dtype", None), "kind", "O")
     if isinstance(value, str | bytes | dict) or kind in "fiubcm" or getattr(value, "ndim", 1) != 1:
         return []
@@ -93,10 +94,10 @@ def _is_date(part: object) -> bool:
 
 
 def _convert_unit(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
-    """Return datetime64 of any unit in nanoseconds, which NumPy lets overflow.
+    """Return datetime64 of any unit in nanoseconds; NumPy alone would let years beyond YEARS overflow silently.
 
     Raises:
-        ValueError: a year that they cannot say.
+        ValueError: a year that nanoseconds since 1970 cannot say in 64 bits; `name` is for the message.
     """
     years = 1970 + np.asarray(moments).astype("datetime64[Y]").astype(np.int64)
     beyond = ~np.isnat(moments) & ((years < YEARS[0]) | (years > YEARS[-1]))
@@ -106,7 +107,7 @@ def _convert_unit(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
 
 
 def row_dates(name: str, rows: object) -> np.ndarray | None:
-    """Return the dates by which the rows of a table, a column or a labelled array are known; None where by none.
+    """Return the dates with which the rows of a table, a column or a labelled array are labelled; None if with none.
 
     Args:
         name: of the rows, for errors.
@@ -128,7 +129,7 @@ def row_dates(name: str, rows: object) -> np.ndarray | None:
 
 
 def _is_date_label(part: object) -> bool:
-    """Return whether a label is a date: of a class of dates, or a text that reads as one."""
+    """Return whether a row's label is a date: of a class of dates, or a text that reads as one."""
     if isinstance(part, str):
         return looks_like_date(part)
     return _is_date(part)

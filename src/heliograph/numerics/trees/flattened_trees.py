@@ -22,7 +22,10 @@ class FlatLayout(NamedTuple):
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def tree(self, rows: jax.Array | np.ndarray) -> PyTree:
-        """Restore the tree from a row, or one with leading axes from rows (..., size), with the original dtypes."""
+        """Return the tree whose leaves lie one after another in a row, with their shapes and dtypes.
+
+        Of rows (..., size) its leaves have the leading axes too.
+        """
         parts, begin = [], 0
         for shape, kind in zip(self.shapes, self.kinds, strict=True):
             end = begin + int(np.prod(shape))
@@ -32,7 +35,7 @@ class FlatLayout(NamedTuple):
 
 
 def make_flat_layout(tree: PyTree) -> FlatLayout:
-    """Return the layout of a tree of arrays."""
+    """Return the layout of a tree of arrays, by which a row is made a tree again: structure, shapes and types."""
     leaves, structure = jax.tree.flatten(tree)
     shapes, kinds = tuple(leaf.shape for leaf in leaves), tuple(str(leaf.dtype) for leaf in leaves)
     return FlatLayout(structure=structure, shapes=shapes, kinds=kinds)

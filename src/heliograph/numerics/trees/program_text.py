@@ -16,7 +16,7 @@ ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
 def hash_numbers(numbers: PyTree) -> str:
-    """Hash all numbers in a tree, or a text."""
+    """Return a hash (DIGITS hexadecimal digits) of a text, or of all numbers in a tree, with their shapes and types."""
     if isinstance(numbers, str):
         return sha256(numbers.encode()).hexdigest()[:DIGITS]
     digest = sha256()
@@ -42,7 +42,10 @@ class _ProgramWriter:
         self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
 
     def write_program(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
-        """Return the lines of a program, its variables numbered in their order."""
+        """Return a program as text: its constants and inputs, a line for each operation, and its results.
+
+        Variables are numbered in their order, so that programs that differ in their names alone have the same text.
+        """
         numbers: dict[Var, int] = {}
         head = [
             f"{self._write_definitions(numbers, jaxpr.constvars)} = {[self._write_value(value) for value in consts]}"
@@ -57,7 +60,7 @@ class _ProgramWriter:
         return f"{self._write_definitions(numbers, equation.outvars)} = {equation.primitive.name} {how} {used}"
 
     def _write_definitions(self, numbers: dict[Var, int], variables: Sequence[Var]) -> str:
-        """Number new variables, in `numbers`; return their types."""
+        """Number new variables, in their order, in `numbers`; return their types (with shapes) as text."""
         for variable in variables:
             numbers[variable] = len(numbers)
         return " ".join(str(variable.aval) for variable in variables)
@@ -85,7 +88,10 @@ class _ProgramWriter:
         return getattr(value, "__name__", "") if callable(value) else ADDRESS.sub("", repr(value))
 
     def _write_hash(self, program: object, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:
-        """Return the hash of an inner program's text, written once."""
+        """Return the hash of an inner program's text, which is written once for each `program` object.
+
+        The object is kept with it, so that its id is given to no other.
+        """
         if id(program) not in self._hashes:
             self._hashes[id(program)] = program, hash_numbers(self.write_program(jaxpr, consts))
         return self._hashes[id(program)][1]
