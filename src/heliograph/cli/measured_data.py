@@ -108,7 +108,7 @@ def read_measured_plants(
     events = read_events(path, reference, network, module, options, advance)
     if events is None:
         if options.are_for_messages or lag is not None:
-            used = "--window, --ahead and --plant" if lag is None else "--lag"
+            used = "--window, --ahead, --lag and --plant" if options.are_for_messages else "--lag"
             raise fail(used, "messages or events", f"rows of time in {path}")
         return [read_rows(path, network, options)]
     wanted = events.plants if options.plant is None else [options.plant]

@@ -232,10 +232,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     time, time_of_row = np.unique(times, return_inverse=True)
 
     def by_time(in_row: np.ndarray) -> np.ndarray:
-        """Return for each distinct time of `time` whether `in_row` is true in any row of it.
-
-        `time_of_row`: index of each row's time.
-        """
+        """Return for each distinct time of `time` whether `in_row` is true in any row of it (`time_of_row`)."""
         at_time = np.zeros(len(time), dtype=bool)
         at_time[time_of_row[in_row]] = True
         return at_time

@@ -190,8 +190,8 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
     if by.op == "constant" and 0 <= by.value < BITS[type]:
         return emit(f"{instruction} {text} {a}, {b}")
     # By at most all bits but one, which leaves the sign; other shifts by more are zero.
-    limit_new_nodes = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
-    shifted = emit(f"{instruction} {text} {a}, {limit_new_nodes}")
+    clamped_shift = emit(f"call {text} @llvm.umin({text} {b}, {text} {write_splat(BITS[type] - 1, type)})")
+    shifted = emit(f"{instruction} {text} {a}, {clamped_shift}")
     if instruction == "ashr":
         return shifted
     in_range = emit(f"icmp ult {text} {b}, {write_splat(BITS[type], type)}")

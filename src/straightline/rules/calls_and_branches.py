@@ -97,11 +97,9 @@ def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[No
     if which.type == "bool":
         return [graph.node("not", "bool", which), which]
     # Branch k is taken if the index is at most k, but not at most k - 1.
-    limit_new_nodes = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
-    between = [
-        graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(limit_new_nodes)
-    ]
-    return [limit_new_nodes[0], *between, graph.node("not", "bool", limit_new_nodes[-1])]
+    at_most = [graph.node("le", "bool", which, graph.constant(k, which.type)) for k in range(count - 1)]
+    between = [graph.node("and", "bool", graph.node("not", "bool", before), here) for before, here in pairwise(at_most)]
+    return [at_most[0], *between, graph.node("not", "bool", at_most[-1])]
 
 
 def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:

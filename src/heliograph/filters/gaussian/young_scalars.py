@@ -43,11 +43,7 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     free = jnp.isnan(given)
 
     def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-        """Return t, the scalars' logarithms, after a step of Newton's method for f(t) = t in the free scalars alone.
-
-        `refined`: f(t); `slopes`: its derivatives; `free`: which scalars are not given by the user, and so are
-        searched.
-        """
+        """Return t, the scalars' logarithms, after a Newton step for f(t) = t in the free ones; `refined`: f(t)."""
         zero_if_given = [
             [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
         ]
@@ -66,8 +62,7 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     def iterate(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the next t = log beta, the one before it, and the number of sweeps.
 
-        `sweep` returns f(t) and its derivatives, t = f(t) the solution; `fixed`: its other arguments; `free`: which
-        scalars are searched. The first sweep takes f(t) itself, the later ones Newton's step.
+        `sweep` returns f(t) and its slopes. The first sweep takes f(t) itself, the later ones Newton's step.
         """
         t, _, sweeps = carry
         refined, slopes = sweep(t, *fixed)

@@ -92,10 +92,7 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     modes = len(told.initial)
 
     def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
-        """Return f(P, a), what a message with these numbers leaves; it does not depend on the values, here zero.
-
-        P: covariance in `prior`; `numbers` a: what the message tells, at the rows `filter.numbers` of z.
-        """
+        """Return f(P, a): the covariance P of `prior` after a message with the numbers a; its values do not matter."""
         z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
         after: LinearBelief = filter.correct(prior, z, k)[0]
         covariance: jax.Array = after.gaussian.covariance
@@ -109,11 +106,7 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
         def step_in_mode(
             covariance: jax.Array, numbers: jax.Array, weights: jax.Array
         ) -> tuple[LinearBelief, jax.Array]:
-            """Return the prediction, and the mean covariance after it over the numbers that this mode may tell.
-
-            `numbers` (count, told) and `weights` (count,): what may be told, with probabilities; `state`, `u_k`: of
-            step k.
-            """
+            """Return the prediction, and the mean covariance after it over the numbers (count, told) of this mode."""
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
             after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
