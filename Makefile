@@ -30,7 +30,7 @@ test: .venv/.test  ## Check style and types, run the tests that guard daily work
 	$(BIN)/pytest $(SPREAD) -m "not slow"; tests=$$?; \
 	wait $$types && exit $$tests
 
-check: .venv/.test  ## Run all other tests: studies from end to end, kills, brokers, a browser (ten to eighteen more)
+check: .venv/.test  ## Run all other tests: studies from end to end, kills, brokers, a browser (twenty to thirty more)
 	$(BIN)/pytest $(SPREAD) -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
