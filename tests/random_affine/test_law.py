@@ -51,7 +51,7 @@ def test_worst_case_is_the_linear_programme(given_law, order):
     # The sum of the probabilities may be off by what the solver calls feasible, 1e-7 by default.
     best = optimize.linprog(-payoff, A_eq=np.ones((1, len(payoff))), b_eq=[1], bounds=list(zip(low, high, strict=True)),
                             options={"primal_feasibility_tolerance": 1e-10})  # fmt: skip
-    assert law.maximise_mean(payoff) == pytest.approx(-best.fun, abs=1e-8)  # the solver's own tolerance
+    assert law.worst(payoff) == pytest.approx(-best.fun, abs=1e-8)  # the solver's own tolerance
 
 
 @given(uncertain_laws(), st.integers(1, 4))
@@ -61,7 +61,7 @@ def test_corners_attain_the_worst_case_and_stay_inside(given_law, order):
     payoff = law.values**order
     # A probability of a corner may lie beyond its end by 1e-12, which another one lacks then.
     allowed = 2e-12 * max(1.0, np.abs(payoff).max())
-    assert max(c.moment(order) for c in corners) == pytest.approx(law.maximise_mean(payoff), abs=allowed)
+    assert max(c.moment(order) for c in corners) == pytest.approx(law.worst(payoff), abs=allowed)
     for corner in corners:
         assert np.all(np.abs(corner.probabilities - law.probabilities) <= law.radius + 1e-12)
         assert corner.probabilities.sum() == pytest.approx(1, abs=1e-12)

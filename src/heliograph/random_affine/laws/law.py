@@ -161,7 +161,7 @@ class Discrete(AbstractLaw):
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
         """Return the lowest and highest E[g^order], also where the corners are too many to list."""
         powers = self.values**order
-        return (-self.maximise_mean(-powers), self.maximise_mean(powers)) if order else (1.0, 1.0)
+        return (-self.worst(-powers), self.worst(powers)) if order else (1.0, 1.0)
 
     def covers(self, own: AbstractLaw) -> bool:
         """Decide whether all that another law may be is possible under this one: same values, probabilities in reach.
@@ -176,7 +176,7 @@ class Discrete(AbstractLaw):
         """Return the values, with their probabilities."""
         return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
-    def maximise_mean(self, payoff: ArrayLike) -> float:
+    def worst(self, payoff: ArrayLike) -> float:
         """Return the exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
         |dp_i| is at most the radius. Start with every probability at its lower end and give the mass that is left to
