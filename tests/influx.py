@@ -53,7 +53,7 @@ class Influx:
             command = [program, "-config", configuration]
             self.process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         self._wait()
-        assert self.send("POST", f"/query?{urlencode({'q': 'CREATE DATABASE plant'})}") == 200
+        self._create_database()
 
     @property
     def url(self) -> str:
@@ -62,12 +62,24 @@ class Influx:
 
     def send(self, method: str, target: str, body: str = "") -> int:
         """Send a request; the status of its answer."""
+        return self._ask(method, target, body)[0]
+
+    def _ask(self, method: str, target: str, body: str = "") -> tuple[int, str]:
+        """Send a request; the status of its answer, and the answer."""
         connection = HTTPConnection("127.0.0.1", self.port, timeout=20)
         try:
             connection.request(method, target, body.encode())
-            return connection.getresponse().status
+            answer = connection.getresponse()
+            return answer.status, answer.read().decode()
         finally:
             connection.close()
+
+    def _create_database(self) -> None:
+        """Make the database; again where a busy server has no time for it, which it says in an answer of status 200."""
+        last, target = time.monotonic() + SECONDS, f"/query?{urlencode({'q': 'CREATE DATABASE plant'})}"
+        while (answer := self._ask("POST", target))[0] != 200 or "error" in answer[1]:
+            assert time.monotonic() < last, answer
+            time.sleep(0.2)
 
     def write(self, lines: str) -> None:
         """Write lines of the protocol, as any other program does; again where a busy server has no time for them."""
