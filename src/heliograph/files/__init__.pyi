@@ -6,7 +6,7 @@ from .device_availability import (
 from .bags.estimates_writer import (
     Pose as Pose,
 )
-from .sources.computed_values import (
+from .sources.derived_values import (
     Covariance as Covariance,
     Geodetic as Geodetic,
     Yaw as Yaw,

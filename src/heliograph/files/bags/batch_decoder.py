@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from heliograph.files.event_table import NONE, EventTable
-from heliograph.files.sources.computed_values import Computed
+from heliograph.files.sources.derived_values import Computed
 from heliograph.files.sources.json_field import Source
 from heliograph.files.sources.sources import SECOND, Sources
 from heliograph.numerics.check import InputError

@@ -1,6 +1,6 @@
 """Names that other folders take; the package loads them when first used."""
 
-from .computed_values import Computed as Computed
+from .derived_values import Computed as Computed
 from .json_field import Source as Source
 from .message_fields import TimeUnit as TimeUnit
 from .message_fields import convert_name as convert_name

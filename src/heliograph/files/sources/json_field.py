@@ -9,7 +9,7 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.files.device_availability import Available
-from heliograph.files.sources.computed_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
+from heliograph.files.sources.derived_values import Computed, Covariance, PlaneCovariance, ZeroIfAbsent
 from heliograph.files.sources.message_fields import TimeUnit, convert_name, convert_time, field_at, parse_start
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import TINY, fail, flag, scalar, show_value

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from heliograph.files.sources.computed_values import Computed, Yaw, ZeroIfAbsent
+from heliograph.files.sources.derived_values import Computed, Yaw, ZeroIfAbsent
 from heliograph.files.sources.json_field import (
     Count,
     Name,

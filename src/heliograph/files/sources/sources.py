@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.files.device_availability import DeviceStatuses
-from heliograph.files.sources.computed_values import Computed, ZeroIfAbsent
+from heliograph.files.sources.derived_values import Computed, ZeroIfAbsent
 from heliograph.files.sources.json_field import Field, Source
 from heliograph.files.sources.message_fields import (
     MissingFieldError,
