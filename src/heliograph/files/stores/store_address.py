@@ -127,9 +127,9 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
     """
     from heliograph.numerics.check import fail
 
-    with_table = [unquote(option) for option in options.split("&") if option]
-    tables = [option.removeprefix("table=") for option in with_table if option.startswith("table=")]
-    others = [option for option in with_table if not option.startswith("table=")]
+    decoded = [unquote(option) for option in options.split("&") if option]
+    tables = [option.removeprefix("table=") for option in decoded if option.startswith("table=")]
+    others = [option for option in decoded if not option.startswith("table=")]
     organisation = ""
     if is_influx and len(others) == 1 and others[0].startswith("org="):
         organisation = others.pop().removeprefix("org=")
