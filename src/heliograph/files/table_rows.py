@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.times.dates import round_to_nanoseconds
 
 EXACT = 2**53  # up to here doubles hold every whole number
 
@@ -60,10 +61,10 @@ def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.
     Raises:
         ValueError: a date that 64 bits of nanoseconds cannot say, or a part of a nanosecond; one line with its row.
     """
-    moments = column.astype("datetime64[ns]")
-    # Converted back, what overflowed or lost a part of a nanosecond is another date.
+    moments = round_to_nanoseconds(column)
+    # Converted back, what nanoseconds do not reach is NaT, and what lost a part of one another date.
     wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise fail(f"{name}, row {first + row}", "a date in whole nanoseconds, from 1678 to 2261", column[row])
-    return np.asarray(moments)
+    return moments

@@ -12,14 +12,17 @@ from heliograph.model.checks.plant_inputs import check_inputs
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import array, check_count, fail, is_whole, rank, show_value
+from heliograph.numerics.times.row_times import check_dates
 from heliograph.numerics.types import ArrayLike, Float, units_in
 
 Horizon = int | float | timedelta | datetime | np.timedelta64 | np.datetime64
 Horizons = TypeAliasType("Horizons", Horizon | Sequence[Horizon] | np.ndarray)
 Inputs = TypeAliasType("Inputs", ArrayLike | Literal["held"] | None)  # rows ahead
 SECOND = 1e9  # nanoseconds
+MONTHS = {"Y": 12, "M": 1}  # in NumPy's units of time that have no length in seconds
 OFF = 0.25  # of a step: months and years differ by less from the usual one
 LONGEST = 1_000_000  # steps ahead
+FARTHEST = 1e15  # seconds, 30 million years: further than any date, and held by 64 bits
 
 
 @runtime_checkable
@@ -35,8 +38,8 @@ class RowsAhead(NamedTuple):
     """Rows to predict over, and which of them the horizons are.
 
     u: inputs of each row. rows: number of the row that ends at each horizon. steps: how far each horizon is, in steps
-    or in
-    the unit of dt. time: of each, on the clock of the data. inputs: whether they are "given", "held" or there are none.
+    or in the unit of dt. time: of each, on the clock of the data. inputs: whether they are "given", "held" or there
+    are none.
 
     Of several plants u and time have a leading axis.
     """
@@ -95,12 +98,16 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     Raises:
         ValueError: no whole number of steps, or a time where that of a step is not known.
     """
+    # Steps of whole months are not of equal length.
+    months = _count_months(origin, horizon) if origin.months else None
+    if months is not None:
+        steps, left = divmod(months, origin.months)
+        if left or not steps:
+            raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(horizon)}, {months} ahead")
+        return float(steps)
     seconds = _convert_to_seconds(origin, horizon)
     if seconds is None:  # a number
         return float(_require_step_count(horizon))
-    # Steps of whole months are not of equal length.
-    if origin.months and isinstance(horizon, datetime | np.datetime64):
-        return _count_months(origin, horizon)
     if not origin.spacing > 0:
         raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
     count = seconds / origin.spacing
@@ -110,13 +117,17 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     return float(round(count))
 
 
-def _count_months(origin: Origin, date: datetime | np.datetime64) -> float:
-    """Return how many steps, each of `origin.months` whole months, a date lies ahead."""
-    apart = np.datetime64(date).astype("datetime64[M]") - _find_end_of_data(origin, date).astype("datetime64[M]")
-    steps, left = divmod(int(apart.astype(int)), origin.months)
-    if left or not steps:
-        raise fail("horizons", f"whole steps of {origin.months} months", f"{show_value(date)}, {apart} ahead")
-    return float(steps)
+def _count_months(origin: Origin, horizon: object) -> int | None:
+    """Return how many months of the calendar a date, or a span of months or years, lies ahead; None of all else."""
+    if isinstance(horizon, np.timedelta64):
+        unit, size = np.datetime_data(horizon)
+        return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
+    if not isinstance(horizon, datetime | np.datetime64):
+        return None
+    seconds = _convert_to_seconds(origin, horizon)  # refuses a date that is not after the data
+    assert seconds is not None
+    date, end = check_dates("horizons", [horizon]), _find_end_of_data(origin, horizon)
+    return int((date[0].astype("datetime64[M]") - end.astype("datetime64[M]")).astype(int))
 
 
 def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
@@ -164,14 +175,29 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
         if unit != "s":
             raise fail("horizons", f"numbers of {unit}, the unit of dt", show_value(horizon))
-        return float(np.timedelta64(horizon, "ns").astype(np.int64)) / SECOND
+        return _convert_span_to_seconds(horizon)
     if not isinstance(horizon, datetime | np.datetime64):
         return None
     end = _find_end_of_data(origin, horizon)
-    ahead = np.datetime64(horizon).astype("datetime64[ns]") - end.astype("datetime64[ns]")
-    if ahead <= np.timedelta64(0, "ns"):
+    # As Python's integers: 64 bits of nanoseconds hold dates of six centuries, but spans of three.
+    ahead = int(check_dates("horizons", [horizon])[0].astype(np.int64)) - int(
+        end.astype("datetime64[ns]").astype(np.int64)
+    )
+    if ahead <= 0:
         raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
-    return float(ahead.astype(np.int64)) / SECOND
+    return ahead / SECOND
+
+
+def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
+    """Return a span of time in seconds; raise of one that is missing, has no unit, or is of months or years."""
+    if isinstance(span, timedelta):
+        return span.total_seconds()
+    unit, size = np.datetime_data(span)
+    if unit == "generic" or unit in MONTHS or np.isnat(span):
+        raise fail("horizons", "spans of weeks or shorter units: a month has no length in seconds", show_value(span))
+    # As Python's integers: NumPy's would overflow.
+    seconds = float(np.array(1, f"timedelta64[{unit}]") / np.timedelta64(1, "s"))
+    return int(span.astype(np.int64)) * size * seconds
 
 
 def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
@@ -251,8 +277,12 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
     if origin.months and not continuous:
         last = end.astype("datetime64[M]")
         ahead = (origin.months * distances).astype(int).astype("timedelta64[M]")
-        return np.asarray((last + ahead).astype("datetime64[ns]"))
+        return check_dates("horizons", last + ahead)
     if np.isnan(spacing):
         return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
-    ahead = np.round(SECOND * spacing * distances).astype(np.int64).astype("timedelta64[ns]")
-    return np.asarray(end.astype("datetime64[ns]") + ahead)
+    # Whole seconds first, in which no date overflows, then what is left of one: nanoseconds end in 2262.
+    seconds = np.minimum(spacing * distances, FARTHEST)
+    last, whole = end.astype("datetime64[s]"), np.floor(seconds)
+    dates = check_dates("horizons", last + whole.astype(np.int64).astype("timedelta64[s]"))
+    rest = np.round(SECOND * (seconds - whole)).astype(np.int64).astype("timedelta64[ns]")
+    return np.asarray(dates + (end.astype("datetime64[ns]") - last) + rest)

@@ -31,7 +31,7 @@ def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:
     """
     kind = numbers.dtype.kind
     if kind == "M":  # dates
-        return np.where(masked, np.datetime64("NaT"), numbers)
+        return np.where(masked, np.array("NaT", numbers.dtype), numbers)
     if kind == "O":  # any objects: numbers if all that is not absent are
         absent = np.array([is_absent(part) for part in numbers.flat], dtype=bool)
         filled = np.where(masked | absent.reshape(numbers.shape), np.nan, numbers)

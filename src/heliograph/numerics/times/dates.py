@@ -22,6 +22,18 @@ MISSING = np.iinfo(np.int64).min  # NumPy's NaT
 YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
 
+def round_to_nanoseconds(dates: np.ndarray) -> np.ndarray:
+    """Return dates of any unit as datetime64[ns], NaT for those of years outside YEARS.
+
+    NumPy before 2.5 would let these overflow into other centuries silently; later ones raise, whichever row it is.
+    """
+    if np.datetime_data(dates.dtype)[0] in {"ns", "ps", "fs", "as"}:  # years around 1970
+        return dates.astype("datetime64[ns]")
+    years = 1970 + dates.astype("datetime64[Y]").astype(np.int64)
+    within = (years >= YEARS[0]) & (years <= YEARS[-1])  # NaT is none of these
+    return np.asarray(np.where(within, dates, np.array("NaT", dates.dtype)).astype("datetime64[ns]"))
+
+
 def looks_like_date(text: str) -> bool:
     """Return whether a text begins like a date of ISO 8601, or is a month (2026-11) or a quarter (2026Q4)."""
     return re.match(r"\d{4}-\d\d-|\d{8}[Tt]\d{4}", text) is not None or MONTH.fullmatch(text) is not None

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.numerics.check import array, fail, show_value
 from heliograph.numerics.masked_arrays import fill_masked
 from heliograph.numerics.numpy_or_jax import is_traced
-from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates
+from heliograph.numerics.times.dates import YEARS, looks_like_date, parse_dates, round_to_nanoseconds
 from heliograph.numerics.types import ArrayLike
 
 NANOSECONDS = np.dtype("datetime64[ns]")
@@ -53,6 +53,14 @@ def _holds_texts_or_spans(value: object) -> bool:
         return False
 
 
+def check_dates(name: str, value: object) -> np.ndarray:
+    """Return dates as datetime64[ns] in UTC, NaT where they are missing; raise ValueError of anything else."""
+    dates = read_dates(name, value)
+    if dates is None:
+        raise fail(name, "dates", show_value(value))
+    return dates
+
+
 def read_dates(name: str, value: object) -> np.ndarray | None:
     """Return dates as datetime64[ns] in UTC, NaT where they are missing; None of what holds no date.
 
@@ -68,13 +76,15 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     if getattr(getattr(value, "dtype", None), "kind", "") == "M":
         given = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
         whole = np.asarray(given)
-        return _convert_unit(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
+        return _convert_to_nanoseconds(name, whole if whole.dtype.kind == "M" else np.asarray(given, NANOSECONDS))
     # Anything else that holds at least one date: all has to be dates then.
     parts = _list_elements(value)
     if not any(_is_date(part) for part in parts):
         return None
     moments = [part.to_timestamp() if hasattr(part, "to_timestamp") else part for part in parts]
-    return parse_dates([str(_convert_unit(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name)
+    return parse_dates(
+        [str(_convert_to_nanoseconds(name, m)) if isinstance(m, np.datetime64) else m for m in moments], name
+    )
 
 
 def _list_elements(value: object) -> list[Any]:
@@ -93,17 +103,18 @@ def _is_date(part: object) -> bool:
     return isinstance(part, str | np.datetime64) or hasattr(part, "isoformat") or hasattr(part, "to_timestamp")
 
 
-def _convert_unit(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
-    """Return datetime64 of any unit in nanoseconds; NumPy alone would let years beyond YEARS overflow silently.
+def _convert_to_nanoseconds(name: str, moments: np.ndarray | np.datetime64) -> np.ndarray:
+    """Return datetime64 of any unit in nanoseconds, NaT where they are missing.
 
     Raises:
         ValueError: a year that nanoseconds since 1970 cannot say in 64 bits; `name` is for the message.
     """
-    years = 1970 + np.asarray(moments).astype("datetime64[Y]").astype(np.int64)
-    beyond = ~np.isnat(moments) & ((years < YEARS[0]) | (years > YEARS[-1]))
+    given = np.asarray(moments)
+    converted = round_to_nanoseconds(given)
+    beyond = np.isnat(converted) & ~np.isnat(given)
     if beyond.any():
-        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(np.asarray(moments)[beyond][0]))
-    return np.asarray(np.asarray(moments).astype(NANOSECONDS))
+        raise fail(name, f"dates from {YEARS[0]} to {YEARS[-1]}", str(given[beyond][0]))
+    return converted
 
 
 def row_dates(name: str, rows: object) -> np.ndarray | None:
