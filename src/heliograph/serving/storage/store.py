@@ -1,6 +1,7 @@
 """Store of a service's state, in one transaction for each batch: plants, outputs, progress; rows with checksums."""
 
 import json
+import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from shlex import quote
@@ -75,6 +76,7 @@ class Store:
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
         self._engine = open_database(location)
+        weakref.finalize(self, self._engine.dispose)  # for a store that is dropped without being closed
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         # A store that cannot be used is closed.
         try:
@@ -277,11 +279,8 @@ class Store:
     def unpublished(self) -> list[Output]:
         """Return outputs with numbers above the last published one: committed here, and perhaps not published."""
         published = self.number(PUBLISHED.format(self.process))
-        return [
-            entry
-            for entry in self.entries(published, self.process)
-            if entry.number is not None and entry.number > published
-        ]
+        entries = self.entries(published, self.process)
+        return [entry for entry in entries if entry.number is not None and entry.number > published]
 
     def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
         """Return the outputs in the journal from the batch that ends after number `after` on, of one process or all.
