@@ -163,7 +163,7 @@ def _append_noise_columns(
     )
 
 
-class DiffuseLikelihood(NamedTuple):
+class MeasurementLikelihood(NamedTuple):
     """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
 
     log_likelihood: jax.Array
@@ -172,7 +172,7 @@ class DiffuseLikelihood(NamedTuple):
 
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
-) -> tuple[Diffuse, DiffuseLikelihood]:
+) -> tuple[Diffuse, MeasurementLikelihood]:
     """Condition x on z = H x + v; return it and what z says of the model.
 
     A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
@@ -200,7 +200,7 @@ def observe_diffuse(
         log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         density = density + jnp.where(present[i], log, 0.0)
         shows_unknown.append(shows & present[i])
-    return state._replace(mean=x.mean + shift), DiffuseLikelihood(density, jnp.stack(shows_unknown))
+    return state._replace(mean=x.mean + shift), MeasurementLikelihood(density, jnp.stack(shows_unknown))
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:

@@ -318,23 +318,24 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     # below say which arguments of a program differ from chunk to chunk.
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        """Return the results of the chunks `which`, filtered in full from these states."""
-        # rows: all data; total: their number; length: rows of a chunk; begun.first: the first row of each chunk.
-        parts = [
-            (recursion, take(states, part), windows, first, total)
-            for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
+        """Return the results of the chunks `which`, filtered in full by `programs.full` from the states `states`.
+
+        Closed over: `recursion` steps the filter; `total` rows of data; chunks of `length` rows begin at `begun.first`.
+        """
+        calls = [
+            (recursion, take(states, batch), windows, first, total)
+            for batch, first, windows in take_windows_in_parts(rows, begun.first[which], length)
         ]
-        return run_and_join(programs.full, parts, [False, True, True, True, False])
+        return run_and_join(programs.full, calls, [False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
-        """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
+        """Return the results of all chunks by covariances and gains of `settled`: only means differ. Else as `scan`."""
         means = means_of(begun.states)
-        # rows: all data; total: their number; length: rows of a chunk; begun: state and first row of each chunk.
-        parts = [
-            (recursion, settled, take(means, part), windows, first, total)
-            for part, first, windows in take_windows_in_parts(rows, begun.first, length)
+        calls = [
+            (recursion, settled, take(means, batch), windows, first, total)
+            for batch, first, windows in take_windows_in_parts(rows, begun.first, length)
         ]
-        joined = run_and_join(programs.settled, parts, [False, False, True, True, True, False])
+        joined = run_and_join(programs.settled, calls, [False, False, True, True, True, False])
         return None if joined is None else (settled.repeat_with_means(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_means_where_settled(begun, scan, scan_means)

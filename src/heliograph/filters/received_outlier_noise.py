@@ -149,7 +149,7 @@ def describe_outlier_noise(
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
-        log_share, mean, variance, late_mean, late_variance = _combine_branches(
+        log_share, mean, variance, late_mean, late_variance = _pair_branches(
             GaussianBranches(log_share, mean, variance), late.branches()
         )
     return ReceivedNoise(
@@ -206,7 +206,7 @@ def _check_weighable(covariance: Array, independent: bool) -> None:
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
-def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
+def _pair_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
     Log probabilities, means and variances of the sensor's, means and variances of the last hop's.

@@ -43,11 +43,7 @@ class AbstractFreshDraw(AbstractMemory):
         return self.begin(key)
 
     def nodes(self, degree: int) -> MemoryStates:
-        """Refuse to list states: what a message tells is no hidden mode that a filter must find out.
-
-        Raises:
-            ValueError: always.
-        """
+        """Raise ValueError: what a message tells is no hidden mode, whose states a filter would weigh."""
         expected = "a filter that takes what a message tells, such as linear_filter or extended_filter"
         raise fail("filter of a link whose gain or noise is told", expected, "one of joint modes")
 
@@ -67,6 +63,7 @@ class FreshNumbers(AbstractFreshDraw):
     identity: str = eqx.field(static=True)
 
     def __init__(self, law: AbstractLaw | AbstractNoise | None, count: int, name: str | None = None):
+        """Hold the joint law of `count` numbers and the name under which links share them."""
         self.law, self.count, self.name, self.identity = law, count, name, identify_memory(name)
 
     @property
@@ -99,6 +96,7 @@ class FreshReading(AbstractFreshDraw):
     identity: str = eqx.field(static=True)
 
     def __init__(self, law: AbstractLaw, variance: Float[Array, ""]):
+        """Hold the law of the gain g and the variance of the reading error e."""
         self.law = require_density(law)
         self.variance = scalar("noise of a pilot", variance, np.finfo(float).tiny)
         self.name, self.identity = None, identify_memory(None)
@@ -187,6 +185,7 @@ class ToldMap(AbstractToldMap):
         exogenous: bool = True,
         fresh: bool = True,
     ):
+        """Hold the memory that draws the numbers and the function `make(numbers)`; check `make(typical)`."""
         self.memory, self.make, self.example, self.names = memory, make, typical, names
         self.exogenous, self.fresh = exogenous, fresh
         link = in_float64(make)(typical)
@@ -271,6 +270,7 @@ class PilotedHop(AbstractHop, AbstractToldMap):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, memory: FreshReading, matrix: Matrix, noise: AbstractNoise, fresh: bool = True):
+        """Hold the drawn gain with its reading, the matrix A and the law of the noise n."""
         self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
         self.exogenous, self.fresh = True, fresh
 

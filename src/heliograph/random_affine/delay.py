@@ -74,6 +74,7 @@ class DelayLine(AbstractDelayLine):
     steps: int = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, past: int):
+        """Hold the link, a map of the present signal stacked over the `past` ones before it, newest first."""
         check_maps("link", [link])
         # The link takes a line of 1 + past signals: the present one and past ones.
         self.link, self.steps = link, check_count("past", past)
@@ -123,6 +124,7 @@ class DelayedLink(AbstractDelayLine):
     timestamped: bool = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
+        """Hold the link and, for each possible delay d, the selection S_d of y_{k-d} with its probability or mode."""
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")

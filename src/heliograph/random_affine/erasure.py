@@ -22,6 +22,7 @@ class Erasure(AbstractMapWrapper):
     arrival: Float[jax.Array | np.ndarray, ""]
 
     def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
+        """Hold the map `base` and the probability `arrival` that its outputs are received."""
         (self.base,) = check_maps("erasure", [base])
         self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
 

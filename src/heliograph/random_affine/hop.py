@@ -84,6 +84,7 @@ class GainAndNoise(AbstractHop):
     def __init__(
         self, law: AbstractLaw, matrix: "Float[ArrayLike, 'm p']", noise: "AbstractNoise | Float[ArrayLike, '*m']"
     ):
+        """Hold the law of the scalar gain g, the matrix A and the law of the additive noise n."""
         if not isinstance(law, AbstractLaw):
             raise fail("gain of a hop", "a law (Constant for a number)", show_value(law))
         self.law = law

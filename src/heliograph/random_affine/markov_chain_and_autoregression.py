@@ -148,6 +148,7 @@ class MarkovChain(AbstractMemory):
         name: str | None = None,
         radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
+        """Hold transition matrix, initial law (None: stationary), name, and the probabilities' largest errors."""
         report_domain("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
         if rows.shape[0] != rows.shape[1] or not rows.size:
@@ -237,6 +238,7 @@ class Autoregression(AbstractMemory):
     identity: str = eqx.field(static=True)
 
     def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
+        """Hold the correlation rho of successive values and the name under which links share the memory."""
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
         self.name, self.identity = name, identify_memory(name)
 

@@ -40,6 +40,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         weights: "Float[ArrayLike, ' maps']",
         radius: "Float[ArrayLike, '*maps']" = 0.0,
     ):
+        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`."""
         self.maps = check_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         self.check_shapes("mixture")

@@ -50,6 +50,7 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
+        """Hold the Markov chain and one memoryless map for each of its modes."""
         if not isinstance(chain, MarkovChain):
             raise fail("chain", "a MarkovChain", show_value(chain))
         self.memory, self.maps = chain, check_maps("maps of the modes", maps)
@@ -191,6 +192,7 @@ class Faded(AbstractHop, AbstractModal):
         matrix: "Float[ArrayLike, 'm p']",
         noise: "AbstractNoise | Float[ArrayLike, '*m']",
     ):
+        """Hold the drift c, mean and deviation of the gain mean + deviation c, the matrix A and the noise's law."""
         if not isinstance(drift, Autoregression):
             raise fail("drift", "an Autoregression", show_value(drift))
         self.memory, self.mean = drift, scalar("mean gain", mean)

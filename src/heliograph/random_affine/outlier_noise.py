@@ -43,6 +43,7 @@ class StudentT(AbstractNoise):
     mean: Vector
 
     def __init__(self, scale: ArrayLike, degrees: ArrayLike):
+        """Hold the scale matrix and the degrees of freedom nu; the mean is zero."""
         self.scale = check.covariance("scale of Student's law", scale, _size_of_number(scale))
         self.degrees = scalar("degrees of Student's law", degrees, TINY)
         self.mean = np.zeros(self.scale.shape[-1])
@@ -135,6 +136,7 @@ class Contaminated(AbstractNoise):
     bounded: bool = eqx.field(static=True)
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        """Hold shares, means and covariances of the mixture: noise without outliers first, then the outliers."""
         # Shares, covariances and biases of the kinds of outliers, one each.
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]

@@ -33,6 +33,7 @@ class Rotation(AbstractRandomAffine):
     deviation: Float[jax.Array | np.ndarray, ""]
 
     def __init__(self, deviation: "Float[ArrayLike, '']"):
+        """Hold the standard deviation of the phase in rad."""
         self.deviation = scalar("deviation of a phase", deviation, 0.0)
 
     @property

@@ -107,6 +107,7 @@ class Series(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        """Hold the maps in the order of their application; each takes as many inputs as the last has outputs."""
         self.maps = check_maps("series", maps)
         for first, second in zip(self.maps, self.maps[1:], strict=False):
             if first.outputs != second.inputs:
@@ -236,6 +237,7 @@ class Stack(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        """Hold the maps, all of which take the same y."""
         self.maps = check_maps("stack", maps)
         if len({m.inputs for m in self.maps}) != 1:
             raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])

@@ -62,6 +62,7 @@ class Superposed(AbstractCombination):
     def __init__(
         self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
     ):
+        """Hold the maps, the law of the noise n, and for each map the indices in y of its inputs (`places`)."""
         self.maps, self.taken = check_maps("sum", maps), check_count("inputs of a sum", inputs)
         self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
         self.places = tuple(

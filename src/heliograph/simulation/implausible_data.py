@@ -80,15 +80,19 @@ def step_plausibly(
         return (turn == 0) | (turn == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
-        """Return the next turn's number, and all filters stepped from `states`, those before the step, in every turn.
+        """Return the next turn's number, and all filters stepped without what the turn before judged implausible.
 
-        They step without what the turn before judged implausible; in turn 0 that is nothing.
+        In turn 0 that is nothing. Closed over, the same in every turn: the network's `filters`, their `states` before
+        the step, its measurements z, inputs u and number k, and the losses `drawn` of the uplinks.
         """
-        turn, (_, before) = carry
-        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_refusal_reasons(before))
+        turn, (_, outputs_before) = carry
+        skip = read_refusal_reasons(outputs_before)
+        after, outputs = _step_filters(filters, states, z, u, k, drawn, skip)
         # The first turn judges all data, the second what is left of them: the first's judgements stay.
         for name in ("judged", "judged_centrally"):
-            outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
+            outputs[name] = jax.tree.map(
+                lambda first, now: jnp.where(turn == 0, now, first), outputs_before[name], outputs[name]
+            )
         return turn + 1, (after, outputs)
 
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), output_shapes)

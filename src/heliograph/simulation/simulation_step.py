@@ -22,7 +22,7 @@ from heliograph.simulation.transmission.channel_draws import (
     number_memory_seeds,
     start_modes,
 )
-from heliograph.simulation.transmission.reception import AbstractMedium
+from heliograph.simulation.transmission.medium import AbstractMedium
 from straightline import present
 
 

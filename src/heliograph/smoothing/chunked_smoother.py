@@ -118,10 +118,11 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     window_ends = np.minimum(begun.first + own + ahead, total)
 
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
-        """Smooth the chunks `which`, filtered from these states; None without native code.
+        """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
-        They pass back from the end of their windows (their `own` rows and those that they look ahead); or, with
-        `later`, from the end of their own rows, where `later` is the smoothed law.
+        They pass back from the end of their `windows` (their `own` rows and those ahead; `window_ends`: the row behind
+        each); or, with `later`, from the end of their own rows, where `later` is the smoothed law. Closed over besides:
+        `recursion`, the filter's step; `begun.first`, the first row of each chunk.
         """
         first = begun.first[which]
         is_given = np.full(len(first), later is not None)

@@ -145,6 +145,7 @@ class FixedLag(AbstractSmoothing):
     lag: int
 
     def __init__(self, lag: int):
+        """Hold the lag: the number of later steps whose data each smoothed estimate uses."""
         self.lag = check_count("lag", lag, 0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
@@ -165,6 +166,7 @@ class FixedPoint(AbstractSmoothing):
     step: int = eqx.field(static=True)
 
     def __init__(self, step: int):
+        """Hold the number of the one time step whose state is smoothed."""
         self.step = check_count("step of a fixed point", step, 0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:

@@ -186,15 +186,16 @@ class EventFilter(AbstractSizedFilter):
         """
 
         def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Update by silence of sender s; no value is expected: zeros in place of its mean and covariance."""
-            return (
-                self._condition_on_silence(augmented, channel, lost, s, begun),
-                jnp.zeros_like(z),
-                jnp.zeros((len(z), len(z))),
-            )
+            """Return the sum given silence of sender s, and zeros for mean and covariance of the value that is missing.
+
+            Closed over: the link `channel`, whether a loss was reported (`lost`), the number s of the sender, whether
+            it has a reference (`begun`), and z, whose length alone counts.
+            """
+            after = self._condition_on_silence(augmented, channel, lost, s, begun)
+            return after, jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
 
         def update_by_value(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Update by the value z."""
+            """Return the sum given the value z of sender s, and the value's predicted mean and covariance."""
             return self._condition_on_value(augmented, channel, z, lost, s, begun)
 
         used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(

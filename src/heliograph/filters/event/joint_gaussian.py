@@ -53,16 +53,15 @@ def augment_by_signal(
     n = len(start)
 
     def augment_one(both: Gaussian) -> Gaussian:
-        """Append y, which depends on x alone, to one Gaussian.
+        """Return the Gaussian of (x, r, y) from that of (x, r): y = slopes (x, r) + noise, by the sensor and transform.
 
         n: length of x; `start`: E[x_i^2] before any data, the size of numbers that rounding acts on.
         """
         signal = find_signal_moments(plant, sensor, transform, take_leading(both, n), start)
-        # No slope in the components behind x.
+        # y does not depend on r, the components behind x.
         slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
-        return append_rows(
-            both, signal.mean, slopes, triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-        )
+        noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
+        return append_rows(both, signal.mean, slopes, noise)
 
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
 
@@ -121,10 +120,10 @@ def condition_parts_on_received(
     size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        """Return one Gaussian given z, and log of the density of z.
+        """Return one Gaussian of (x, r, y) given z, and log of the density of z.
 
-        `arrived`: which of the sender's components arrived; `delivers`: the link hands on y itself, the last m
-        components of `size`.
+        Closed over: z, the sender's measurement, of which `arrived` came; `link`, moments of z given y; `sender`, its
+        components of y (m,); `delivers`: z is y itself, the last m of the Gaussian's `size` components.
         """
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)

@@ -155,6 +155,7 @@ class PolynomialMoments(AbstractTransform):
     degree: int = eqx.field(static=True)
 
     def __init__(self, degree: int):
+        """Hold the degree of the polynomials whose moments are taken exactly."""
         self.degree = check_count("degree of the polynomial", degree)
 
     def image(self, function: Function, x: Gaussian) -> Image:

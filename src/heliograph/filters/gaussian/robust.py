@@ -50,6 +50,7 @@ class Huber(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']" = 1.345):
+        """Hold c, the normalised innovation |d| beyond which a measurement's weight falls as c / |d|."""
         self.c = scalar("constant of Huber's rule", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
@@ -67,6 +68,7 @@ class InverseMultiquadric(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']" = 3.0):
+        """Hold c, the normalised innovation |d| at which the weight 1 / (1 + d^2 / c^2) is a half."""
         self.c = scalar("constant of the inverse multiquadric rule", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
@@ -83,6 +85,7 @@ class WoLF(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']"):
+        """Hold c, the innovation in deviations of the noise at which the weight 1 / (1 + e^2 / (c^2 r)) is a half."""
         self.c = scalar("constant of the weighted likelihood filter", c, TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
@@ -135,6 +138,7 @@ class StudentVB(AbstractWeightingRule):
     degrees: Degrees
 
     def __init__(self, iterations: int = 4):
+        """Hold the number of variational updates; the filter that uses the rule fills in the degrees of freedom nu."""
         self.iterations = check_count("iterations of variational Bayes", iterations)
         self.degrees = np.zeros(0)
 

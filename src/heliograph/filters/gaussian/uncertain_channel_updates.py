@@ -126,6 +126,7 @@ class Polytope(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
+        """Hold Young's scalars (beta_1, beta_2); None minimises the bound's trace over them at each step."""
         self.scalars = scalars_as_array(scalars)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
@@ -187,6 +188,7 @@ class Interval(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
+        """Hold Young's scalars (beta_1, beta_2); None minimises the bound's trace over them at each step."""
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:

@@ -66,6 +66,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def __init__(
         self, inner: AbstractFilter, degree: int, endless: bool = False, centre: UnconditionalMean | None = None
     ):
+        """Wrap `inner`, a filter of z's monomials up to `degree`; see the class for `endless` and `centre`."""
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim

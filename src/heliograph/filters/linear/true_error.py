@@ -93,7 +93,7 @@ def true_error(
     difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         transition = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
-        moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
+        moments = _predict_joint_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
         moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(difference @ moments.sum(axis=0) @ difference.T)
     # Claimed covariances lie as start, then before and after correction of each step: every second one from the third.
@@ -113,7 +113,7 @@ def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, chan
         raise fail("filter", f"one of {n} states that receives {received} numbers", got)
 
 
-def _propagate_moments(
+def _predict_joint_moments(
     moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after the prediction of a step.

@@ -50,10 +50,10 @@ def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequenc
     degree = np.full(x.shape, GIVEN)
     degree[list(places)] = AFFINE
     arguments = [_EntryDegrees(degree), *(_EntryDegrees(np.full(np.shape(argument), GIVEN)) for argument in rest)]
-    return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, arguments))
+    return all(np.all(result.degree <= AFFINE) for result in _classify_dependence(program, arguments))
 
 
-def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
+def _classify_dependence(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of a program's results, operation by operation.
 
     A degree says how an entry depends on the arguments: known, given, affine, or otherwise.
@@ -89,7 +89,7 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
         return list(results) if equation.primitive.multiple_results else [results]
 
     if (called := called_program(equation)) is not None:
-        return _trace_degrees(called, x)
+        return _classify_dependence(called, x)
     # Known operands give known results, given ones given results.
     if all(operand.value is not None for operand in x):
         return [_trace_known_array(value) for value in compute([operand.value for operand in x])]

@@ -332,7 +332,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, self.drawn)
 
         def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
-            """Return x given z of one atom, and the log density of z."""
+            """Return x given z = gain h(x) + offset + noise, and log p(z); h(x) = y + slopes xi, x = m + L xi."""
             return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
         atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))

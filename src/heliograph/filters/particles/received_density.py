@@ -45,13 +45,13 @@ class ReceivedAtoms(Module):
         p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles`: components of z.
         """
         present = ~jnp.isnan(z)
-        both = present[:, None] & present
+        both_present = present[:, None] & present
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
-            """Return log N(z; gain y + offset, noise) of one atom (N,).
+            """Return log N(z; gain y + offset, noise) of one atom (N,), `noise` a covariance; -inf where E z is NaN.
 
-            y (N, p): signals of N particles; `present` (m,): which components of z arrived, `both` (m, m): which pairs;
-            LOG_TURN: log 2 pi. -inf where E z is no number.
+            y (N, p): signals of N particles; `present` (m,): which components of z arrived, `both_present` (m, m): of
+            which pairs both did; `angles`: which are angles; LOG_TURN: log 2 pi.
             """
             # z - E z, 0 for what did not arrive and for an E z that is no number.
             expected = y @ gain.T + offset
@@ -59,10 +59,10 @@ class ReceivedAtoms(Module):
             value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
             value = jnp.where(valid[:, None] & present, value, 0.0)
             # Whitened by the factor of the noise; what did not arrive has variance 1.
-            factor = jnp.linalg.cholesky(jnp.where(both, noise, jnp.eye(len(z))))
-            white = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
+            factor = jnp.linalg.cholesky(jnp.where(both_present, noise, jnp.eye(len(z))))
+            whitened = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
             log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
-            return jnp.where(valid, -(jnp.sum(white**2, axis=1) + log_determinant) / 2, -jnp.inf)
+            return jnp.where(valid, -(jnp.sum(whitened**2, axis=1) + log_determinant) / 2, -jnp.inf)
 
         # log of the weighted sum over the atoms.
         atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)

@@ -78,13 +78,21 @@ def sum_neighbouring_words(
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
-        """Return the likelihood of the bits above a block for each combination, times its probability."""
+        """Return the likelihood of the bits above a block (those that name it) for each combination of error rates,
+        times the combination's probability.
+
+        Closed over: `pairs`, likelihoods of the bits, `weights`; `start`, the first word's number; `size` of a block.
+        """
         return weights * jnp.stack([multiply_bits(pair[BLOCK:], start / size + block) for pair in pairs])
 
     def add_block(
         carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
     ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
-        """Add the edges of one block: those above each of its words."""
+        """Add the sums over the edges above each word of one block; `above`: the likelihood of the bits above it.
+
+        Closed over: `tables`, likelihoods of a block's words by their low bits; `blocks`, of `size` words each, the
+        first word's number being `start`; `grid`, the words; `prior` of y; the encoder's `dither`.
+        """
         total, above = carried
         following = weigh_bits_above(block + 1)
         likelihood = above @ tables
@@ -234,14 +242,17 @@ def find_effect_of_bits(
         return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
     def sum_wide_words() -> WordEffect:
-        """Sum word by word within the prior's reach."""
+        """Return the effect on y by a sum over words within the prior's reach: 8.5 deviations of its mean.
+
+        Closed over: `pairs`, likelihoods of the bits for each combination of error rates, `weights` its probability;
+        `received`, the word that came; `grid`, the words; `prior` of y; the encoder's `dither`.
+        """
         return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
 
     def sum_fine_words() -> WordEffect:
-        """Sum over cells of several words each, and over the overloads beyond the ends.
+        """Return the effect on y by a sum over cells of several words, and over what lies beyond the end words.
 
-        `pairs`: likelihoods of bits for each law of the link, `weights` the laws' probabilities. The dither's variance
-        widens the prior, and is removed after.
+        Closed over as in `sum_wide_words`. The dither's variance widens the prior, and is removed after.
         """
         wider, wide = widen_by_dither(prior, grid, dither)
         sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]

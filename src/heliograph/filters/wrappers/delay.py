@@ -48,6 +48,7 @@ class PartFilter(AbstractWrapper):
     base: AbstractFilter
 
     def __init__(self, base: AbstractFilter, states: int):
+        """Wrap the filter `base` so that only its first `states` states are estimated."""
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
@@ -220,6 +221,7 @@ class LateFilter(AbstractWrapper):
     delay: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractFilter, delay: int):
+        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late."""
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
 

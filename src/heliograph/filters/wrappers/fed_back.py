@@ -43,6 +43,7 @@ class PredictionFilter(AbstractWrapper):
     base: GaussianFilter
 
     def __init__(self, base: GaussianFilter):
+        """Wrap the Gaussian filter `base`, whose predictions are to be the estimates."""
         self.base, self.claim = base, base.claim
         self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 

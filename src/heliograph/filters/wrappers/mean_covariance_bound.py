@@ -106,7 +106,11 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
         def step_in_mode(
             covariance: jax.Array, numbers: jax.Array, weights: jax.Array
         ) -> tuple[LinearBelief, jax.Array]:
-            """Return the prediction, and the mean covariance after it over the numbers (count, told) of this mode."""
+            """Return the prediction in one mode, and the mean covariance after the message, sum_a p(a) f(P, a).
+
+            `covariance`: before the step; `numbers` (count, told): the messages a that the mode may bring, `weights`
+            their probabilities. Closed over: the `filter`, its `state`, input `u_k` and number k of the step.
+            """
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
             after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)

@@ -19,6 +19,7 @@ class Rayleigh(AbstractLaw):
     scale: Scalar
 
     def __init__(self, scale: "Float[ArrayLike, '']"):
+        """Hold the standard deviation of the complex Gaussian's real part, which is its imaginary part's too."""
         self.scale = scalar("Rayleigh scale", scale, 0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -49,6 +50,7 @@ class Rician(AbstractLaw):
     scale: Scalar
 
     def __init__(self, sight: "Float[ArrayLike, '']", scale: "Float[ArrayLike, '']"):
+        """Hold the line of sight's amplitude and the standard deviation of the scatter's real and imaginary part."""
         self.sight = scalar("Rician line of sight", sight, 0.0)
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
@@ -109,6 +111,7 @@ class Nakagami(AbstractLaw):
     power: Scalar
 
     def __init__(self, shape: "Float[ArrayLike, '']", power: "Float[ArrayLike, '']" = 1.0):
+        """Hold the shape m, at least 1/2, and the mean power E[g^2]."""
         self.shape = scalar("Nakagami shape", shape, 0.5)
         self.power = scalar("Nakagami power", power, 0.0)
 
@@ -150,6 +153,7 @@ class LogNormal(AbstractLaw):
     log_deviation: Scalar
 
     def __init__(self, log_mean: "Float[ArrayLike, '']", log_deviation: "Float[ArrayLike, '']"):
+        """Hold mean and standard deviation of log g."""
         self.log_mean = scalar("log-normal mean", log_mean)
         self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
 

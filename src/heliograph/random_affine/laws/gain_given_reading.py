@@ -116,7 +116,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     # The part of these that does count: within NATS of the mode.
     mode = _find_density_mode(log_density, low, high)
     least = log_density(mode) - NATS
-    left, right = _find_density_end(log_density, low, mode, least), _find_density_end(log_density, high, mode, least)
+    left, right = _find_density_edge(log_density, low, mode, least), _find_density_edge(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
@@ -145,7 +145,7 @@ def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array)
     return middle
 
 
-def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
+def _find_density_edge(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
     """Return a place near the one where the density rises above `least`, on its side towards `outer`.
 
     Args:

@@ -118,6 +118,7 @@ class Constant(AbstractLaw):
     value: Scalar
 
     def __init__(self, value: "Float[ArrayLike, '']"):
+        """Hold the value that the gain has with probability 1."""
         self.value = scalar("constant gain", value)
 
     @property
@@ -146,6 +147,7 @@ class Discrete(AbstractLaw):
     radius: np.ndarray
 
     def __init__(self, values: ArrayLike, probabilities: ArrayLike, radius: ArrayLike = 0.0):
+        """Hold the possible gains, their probabilities, and how far each probability may be off (`radius`)."""
         self.values = array("gain values", values, (None,))
         self.probabilities = check.probabilities("gain probabilities", probabilities, len(self.values))
         self.radius = radii("probability radius", radius, self.probabilities)
@@ -244,6 +246,7 @@ class CertainDiscrete(Discrete):
     """
 
     def __init__(self, law: Discrete):
+        """Take values and probabilities from `law`, whose probabilities must have no radius of uncertainty."""
         if np.any(law.radius > 0):
             raise fail("probabilities of a gain", "known ones, beside what a message tells", "uncertain ones")
         self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
@@ -283,6 +286,7 @@ class GivenMoments(AbstractLaw):
     moments: Vector
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
+        """Hold E[g], E[g^2], ..., refused unless their Hankel matrix is that of some distribution."""
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return

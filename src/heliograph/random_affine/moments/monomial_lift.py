@@ -35,6 +35,7 @@ class Lift(AbstractMapWrapper):
     degree: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
+        """Hold the map `base`, which must not erase, and the highest degree of the monomials."""
         check_count("degree of the lift", degree)
         (base,) = check_maps("lift", [base])
         if base.erases:

@@ -17,7 +17,7 @@ import numpy as np
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import scatter
+from heliograph.numerics.numpy_or_jax import is_zero, plain, scatter
 from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
@@ -171,6 +171,17 @@ def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variab
     """Multiply two homogeneous polynomials given by coefficients."""
     terms = a[:, None] * b
     return scatter((count_monomials(variables, first + second),), product_table(variables, first, second), terms)
+
+
+def multiply_by_linear_form(polynomial: dict[Exponents, Numbers], row: Numbers) -> dict[Exponents, Numbers]:
+    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
+    product: dict[Exponents, Numbers] = {}
+    nonzero = [j for j, entry in enumerate(row) if not is_zero(entry)]
+    for a, coefficient in polynomial.items():
+        for j in nonzero:
+            exponents_times_u_j = (*a[:j], a[j] + 1, *a[j + 1 :])
+            product[exponents_times_u_j] = product.get(exponents_times_u_j, 0.0) + coefficient * plain(row[j])
+    return product
 
 
 @cache_arrays

@@ -102,6 +102,7 @@ class TabulatedNoise(AbstractNoise):
     order: int = eqx.field(static=True)
 
     def __init__(self, source: AbstractNoise, order: int):
+        """Compute the table of the noise's moments up to `order`; `source` is the noise itself."""
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
         self.table, self.order = noise_moment_vector(source, order), order
 

@@ -70,6 +70,7 @@ class RoundedNoise(AbstractNoise):
         gaussian: bool = False,
         matters: bool = False,
     ):
+        """Hold the law of v, and step D, half range, centre and dither of the rounding; flags as in the class."""
         # The sensor's noise; step D of the rounding, half of its range and its centre, by component; its dither.
         self.source, self.step, self.half, self.centre = source, step, half, centre
         self.dither, self.gaussian, self.matters = dither, gaussian, matters

@@ -297,7 +297,7 @@ class NodeFiltersWithoutData(Protocol):
         """Return the filters' states after step k."""
 
 
-class CentreFilterState(NamedTuple):
+class CentreJointState(NamedTuple):
     """What the centre knows after a step.
 
     Args:
@@ -333,16 +333,14 @@ class CentreFilter(AbstractSizedFilter):
     quantized: bool = eqx.field(static=True)
 
     @compile_in_float64
-    def init(self) -> CentreFilterState:
+    def init(self) -> CentreJointState:
         """Return the state before any report: nodes' filters, moments of their errors, and what the centre believes."""
         states, _, _, known, *_ = self.filters.init()
         errors = known[0].errors
-        return CentreFilterState(
-            states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
-        )
+        return CentreJointState(states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized))
 
     @predicts
-    def predict(self, state: CentreFilterState, u: ArrayLike = (), k: Step = 0) -> CentreFilterState:
+    def predict(self, state: CentreJointState, u: ArrayLike = (), k: Step = 0) -> CentreJointState:
         """Return the state after the nodes filtered step k and sent their reports: plant and all errors are predicted.
 
         The nodes' gains depend on no data, so that the centre computes them itself.
@@ -351,10 +349,10 @@ class CentreFilter(AbstractSizedFilter):
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
         happened = centre.step_errors(state.errors, filters, u, step)
         following = self.filters.step_without_data(state.nodes, u, step)
-        return CentreFilterState(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
+        return CentreJointState(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
 
     @corrects
-    def correct(self, state: CentreFilterState, z: ArrayLike, k: Step = 0) -> tuple[CentreFilterState, Innovation]:
+    def correct(self, state: CentreJointState, z: ArrayLike, k: Step = 0) -> tuple[CentreJointState, Innovation]:
         """Return the state corrected by the reports that arrived, and their innovation; z is NaN where one did not.
 
         `rows`: places of z among all numbers that could come, (age, node, widest): of every delay, padded to the
@@ -367,6 +365,6 @@ class CentreFilter(AbstractSizedFilter):
         return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
 
     @estimates
-    def estimate(self, state: CentreFilterState) -> Estimate:
+    def estimate(self, state: CentreJointState) -> Estimate:
         """Return the best linear estimate of the plant's state."""
         return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

@@ -274,9 +274,10 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
     constrained = best
 
     def compute_excess_fall(distance: float) -> float:
-        """Return by how much the log-likelihood falls at this distance from the best number, less REACH, 1.92 nats.
+        """Return by how much the log-likelihood falls at this distance from the maximum, less REACH, 1.92 nats.
 
-        All other numbers are at their best there. `number`: which one it is; `sign`: in which direction.
+        The distance is one of the logarithm with index `number`, upwards for `sign` 1; all others are at their best.
+        Closed over: `best`, the maximum; `declared`, the filter and its recording.
         """
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()
@@ -319,8 +320,8 @@ def _maximise_likelihood(
     def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
         """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
 
-        `logs`: the free ones of all logarithms, the others staying as in `start`. `moves`: a row for each free one,
-        which moves it by DIFFERENCE. A likelihood that is no number counts as LOST nats below any.
+        `logs`: the free logarithms (where `free`), the others staying as in `start`; `low`, `high`: limits of all.
+        `moves`: a row for each free one, which moves it by DIFFERENCE. A likelihood that is NaN counts as -LOST nats.
         """
         all_logs = start.copy()
         all_logs[free] = logs

@@ -82,6 +82,7 @@ class WideAngles:
     """
 
     def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
+        """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
         instance("filter", filter, AbstractFilter, "a filter")
         used = None if filter.claim == "none" else filter.angles_used()
         self.states = {} if used is None else {i: filter.states[i] for i in used.states}

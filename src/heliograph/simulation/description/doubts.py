@@ -27,9 +27,9 @@ from heliograph.simulation.covariance_claims import MistakenBelief, yield_mistak
 from heliograph.simulation.declared_noise.refit import list_links_declaring_noise
 from heliograph.simulation.description.angle_doubts import doubt_degrees_at_start, doubt_wide_angles_at_start
 from heliograph.simulation.description.diagram import list_rounded_numbers, list_shared_in_words
+from heliograph.simulation.description.execution_fallbacks import describe_sequential_filters, explain_xla_fallbacks
 from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
 from heliograph.simulation.description.separable_nodes import separate_nodes
-from heliograph.simulation.description.slow_filters import describe_sequential_filters, explain_xla_fallbacks
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.overloaded_words import find_overloads

@@ -222,6 +222,7 @@ class RowSmoother:
     """
 
     def __init__(self, network: Network, dt: int | None):
+        """Prepare the backward sweep of the network's filters as arrays and code; `dt`: index of the time step in u."""
         instance("network", network, Network, "a Network")
         if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
             raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))

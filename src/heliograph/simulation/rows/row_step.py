@@ -111,6 +111,7 @@ class RowStep:
 
     @in_float64
     def __init__(self, network: Network):
+        """Lay out state, measurement and outputs of one step of the network's filters in rows; compile the step."""
         instance("network", network, Network, "a Network")
         self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
@@ -228,6 +229,7 @@ class OneRowStep:
     """
 
     def __init__(self, steps: RowStep, code: Any):
+        """Hold the step of many rows and the native code for one; None where XLA runs it."""
         self._steps, self._code = steps, code
 
     def __call__(self, *parts: Float[np.ndarray, "1 columns"]) -> Float[np.ndarray, "1 column"]:
@@ -317,7 +319,8 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
         """Return the states and outputs after each of `width` rows, zero behind the first `turns` turns of the loop.
 
-        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step.
+        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step. Closed over: `step` of one
+        row; `layout` and `outputs`, the lengths of a row's state and outputs.
         """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:

@@ -61,12 +61,14 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     def compute_share(core: int) -> PyTree:
         """Return the results of one core's runs, `share` of all: `blocks` blocks of `width` runs in parallel.
 
-        Missing runs are filled up, and their results are cut off again.
+        Missing runs are filled up, and their results are cut off again. Closed over: the `function` of one run, and
+        its arguments `values`, each (runs, ...).
         """
         first, stop = core * share, min((core + 1) * share, runs)
-        parts = [_pad_runs(a[first:stop], share).reshape(blocks, width, *a.shape[1:]) for a in values]
+        padded = [_pad_runs(a[first:stop], share) for a in values]
+        by_block = [a.reshape(blocks, width, *a.shape[1:]) for a in padded]
         with jax.enable_x64(True):
-            outputs = to_numpy(_map_blocks(function, parts))
+            outputs = to_numpy(_map_blocks(function, by_block))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: stop - first], outputs)
 
     # Each core computes its blocks, then copies them to their place; few runs need fewer cores.

@@ -20,7 +20,7 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.runs.stacked_filters import StackedFilters
 from heliograph.simulation.simulation_step import World
 from heliograph.simulation.transmission.build_reception import make_reception
-from heliograph.simulation.transmission.reception import SeparateChannels
+from heliograph.simulation.transmission.medium import SeparateChannels
 
 M = TypeVar("M", bound=Module)
 

@@ -15,7 +15,7 @@ from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import checksum
 from heliograph.simulation.transmission.channel_draws import number_memory_seeds
-from heliograph.simulation.transmission.reception import (
+from heliograph.simulation.transmission.medium import (
     AbstractMedium,
     CommonChannel,
     NodeGroup,

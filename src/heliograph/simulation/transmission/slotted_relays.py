@@ -17,7 +17,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
 from heliograph.simulation.transmission.channel_draws import deliver_signal, start_channel
-from heliograph.simulation.transmission.reception import AbstractMedium, Measurements
+from heliograph.simulation.transmission.medium import AbstractMedium, Measurements
 
 
 class RelayStates(NamedTuple):
