@@ -72,7 +72,9 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explanation
+    return choose_code(
+        function, jax.tree.map(np.asarray, arguments), differs_by_run=[True] * len(arguments)
+    ).explanation
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
@@ -87,7 +89,10 @@ def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
 
 
 def choose_code(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
+    function: Callable[..., PyTree],
+    arguments: Sequence[PyTree],
+    differs_by_run: Sequence[bool],
+    most: int | None = None,
 ) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
@@ -96,7 +101,7 @@ def choose_code(
     Args:
         function: a function of the arrays of one run.
         arguments: its arguments.
-        differs: for each argument, whether it has a leading axis of runs; the others are shared by all runs.
+        differs_by_run: for each argument, whether it has a leading axis of runs; the others are shared by all runs.
         most: operations above which XLA computes, unless native code is forced; no limit by default.
 
     Raises:
@@ -105,7 +110,7 @@ def choose_code(
     engine = read_forced_engine()
     if engine == "xla":
         return EngineChoice(code=None, why=f"{SETTING} is set to it")
-    choice = _find_compiled_code(function, arguments, differs, None if engine == "native" else most)
+    choice = _find_compiled_code(function, arguments, differs_by_run, None if engine == "native" else most)
     # LLVM may refuse what was lowered: only an attempt shows it.
     if choice.code is not None and (why := choice.code.generate_code(choice.arrays)):
         choice = EngineChoice(code=None, why=why)
@@ -126,7 +131,7 @@ def compute_once(
         most: operations above which XLA computes; no limit by default, so that XLA has only what native code refuses.
     """
     with jax.enable_x64(True):
-        choice = choose_code(function, arguments, [False] * len(arguments), most)
+        choice = choose_code(function, arguments, differs_by_run=[False] * len(arguments), most=most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
         # The code computes runs, here one. `[0, ...]` keeps arrays, where `[0]` would make NumPy's scalars.
@@ -210,20 +215,23 @@ def make_native_or_none(make: Callable[[], Code]) -> Code | None:
 
 
 def _find_compiled_code(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
+    function: Callable[..., PyTree],
+    arguments: Sequence[PyTree],
+    differs_by_run: Sequence[bool],
+    most: int | None = None,
 ) -> EngineChoice:
     """Return the native code of a function for arguments of this structure, compiled once, or why there is none.
 
     Args:
         function: the function, which may be a tree with arrays itself, as a bound method of a filter is.
         arguments: trees with arrays.
-        differs: for each argument whether its arrays have a leading axis of runs.
+        differs_by_run: for each argument whether its arrays have a leading axis of runs.
         most: operations above which there is no code; the compiler's own limit if None.
     """
     leaves, structure = jax.tree.flatten((function, *arguments))
     # The same of each leaf; those of the function have no axis of runs.
     leaf_differs = [False] * len(jax.tree.leaves(function))
-    for argument, argument_differs in zip(arguments, differs, strict=True):
+    for argument, argument_differs in zip(arguments, differs_by_run, strict=True):
         leaf_differs += [argument_differs] * len(jax.tree.leaves(argument))
     # The key of the cache of code: the structure and its leaves, of arrays their shape in one run and their type.
     # Arrays become arguments of the code; all other leaves are part of it.
@@ -252,7 +260,7 @@ class _ArrayOfRun(NamedTuple):
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    differs: bool
+    differs_by_run: bool
 
 
 @lru_cache(COMPILED)
@@ -277,7 +285,7 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 
     placeholder: Any = jax.ShapeDtypeStruct
     examples = [placeholder(array.shape, array.dtype) for array in arrays]
-    shared = [n for n, array in enumerate(arrays) if not array.differs]  # numbers of the arguments that all runs share
+    shared = [n for n, array in enumerate(arrays) if not array.differs_by_run]
     try:
         return compile(call, *examples, shared=shared, most=most), ""
     except Unsupported as error:

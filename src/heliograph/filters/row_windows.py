@@ -68,14 +68,16 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     return jax.tree.map(take_from, rows)
 
 
-def run_and_join(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs: Sequence[bool]) -> PyTree:
+def run_and_join(
+    function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs_by_run: Sequence[bool]
+) -> PyTree:
     """Return the results of runs of several lists of arguments in the same arrays; None without native code.
 
-    `differs` says of which arguments each run has its own.
+    `differs_by_run` says of which arguments each run has its own.
 
     Lists of arguments differ in length of the axis of runs; the same compiled code computes all.
     """
-    choices = [choose_code(function, arguments, differs) for arguments in parts]
+    choices = [choose_code(function, arguments, differs_by_run=differs_by_run) for arguments in parts]
     codes = [choice.code for choice in choices]
     return None if None in codes else codes[0].compute_calls([choice.arrays for choice in choices])
 

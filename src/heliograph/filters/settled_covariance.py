@@ -102,7 +102,7 @@ def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead:
     if varies is None:
         return None
     arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
-    choice = choose_code(_repeat_row_over_windows, arguments, [False] * len(arguments))
+    choice = choose_code(_repeat_row_over_windows, arguments, differs_by_run=[False] * len(arguments))
     return None if choice.code is None else find_unchanged_state(varies, *choice.results())
 
 
@@ -156,7 +156,7 @@ def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree)
     """
     rows, means = jax.tree.map(lambda leaf: leaf[None], row), [np.asarray(mean)[None] for mean in means_of(start)]
     arguments = recursion, start, means, rows, np.zeros(1, int)
-    choice = choose_code(step_settled, arguments, [False, False, True, True, True])
+    choice = choose_code(step_settled, arguments, differs_by_run=[False, False, True, True, True])
     if choice.code is None:
         return None
     after, outputs = jax.tree.unflatten(choice.code.tree, choice.code.common)

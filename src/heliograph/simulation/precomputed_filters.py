@@ -38,7 +38,7 @@ def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
     """
     count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
     with jax.enable_x64(True):
-        choice = choose_code(_precompute_filter, arguments, (True, False, False))
+        choice = choose_code(_precompute_filter, arguments, differs_by_run=(True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
     # What is the same for all filters is computed once, and repeated for each.

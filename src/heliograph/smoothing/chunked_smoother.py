@@ -132,7 +132,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
         differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
-        choice = choose_code(smooth_chunk, arguments, differs_by_chunk)
+        choice = choose_code(smooth_chunk, arguments, differs_by_run=differs_by_chunk)
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:

@@ -38,11 +38,11 @@ class GaussianSum(NamedTuple):
 
         They need not sum to 1: their sum multiplies the Gaussian's weight. Where it is 0 the label stays.
         """
-        shape = (-1, *[1] * (label.ndim - 1))
+        beside_label = (-1, *[1] * (label.ndim - 1))
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
-        share = label / jnp.where(total > 0, total, 1.0).reshape(shape)
-        share = jnp.where((total > 0).reshape(shape), share, self.label[:, s])
-        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(share))
+        normalised = label / jnp.where(total > 0, total, 1.0).reshape(beside_label)
+        normalised = jnp.where((total > 0).reshape(beside_label), normalised, self.label[:, s])
+        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(normalised))
 
     def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
         """Multiply all weights by exp(log_factor)."""
@@ -76,9 +76,9 @@ def log_total_weight(log_weight: jax.Array) -> jax.Array:
 
     `log_weight` (K,); relative to the largest one, so that no exponential overflows.
     """
-    top = jnp.max(log_weight)
-    top = jnp.where(jnp.isfinite(top), top, 0.0)
-    return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
+    largest = jnp.max(log_weight)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    return largest + safe_log(jnp.sum(jnp.exp(log_weight - largest)))
 
 
 def concatenate_sums(parts: Sequence[GaussianSum]) -> GaussianSum:
@@ -98,13 +98,13 @@ def truncate_between(parts: GaussianSum, direction: jax.Array, lower: jax.Array,
 def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians.
 
-    `row`, `centre`: slopes and mean of d'x in each Gaussian.
+    `mean`, `slopes`: those of d'x in each Gaussian, x = m + L xi.
     """
-    row, centre = _project_on_direction(parts, direction)
+    slopes, mean = _project_on_direction(parts, direction)
     # d'x <= -edge is (-d)'x >= edge: the second half is truncated with both signs turned.
-    edges = jnp.full(2 * len(centre), edge)
-    centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
-    return _truncate(concatenate_sums([parts, parts]), centre, row, [edges])
+    edges = jnp.full(2 * len(mean), edge)
+    mean, slopes = jnp.concatenate([mean, -mean]), jnp.concatenate([slopes, -slopes])
+    return _truncate(concatenate_sums([parts, parts]), mean, slopes, [edges])
 
 
 def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -149,12 +149,12 @@ def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
 def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
     """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
 
-    The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
-
-    w1 and w2 are the weights of both, and `places` is a range of the vector's components.
+    The cost of a pair of weights w1 and w2 is w1 w2 / (w1 + w2) times its squared distance in a range of the vector's
+    components, each in units of its variances.
     """
     while len(parts.log_weight) > count:
-        parts = _merge_cheapest_pair(parts, (places.start, places.stop))
+        first, stop = places.start, places.stop
+        parts = _merge_cheapest_pair(parts, (first, stop))
     return parts
 
 

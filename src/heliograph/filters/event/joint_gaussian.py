@@ -85,12 +85,10 @@ def predict_with_reference(
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Return the Gaussian with the components at `places` replaced by known values, of variance zero.
+    """Return the Gaussian with the components at `places` replaced by known values, independent of all others.
 
-    Covariance: root diag(variances) root'. A known component is a column of its own, of variance 0: its row of the root
-    is the row of the identity.
-
-    Components at `places` are taken as independent of the others.
+    With the covariance root diag(variances) root' a known component has a column of its own, of variance 0, and as
+    its row of the root that of the identity. The root is made lower triangular again.
     """
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
@@ -143,7 +141,7 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
     """
 
     def receive_one(x: Gaussian) -> Gaussian:
-        """Predict z from one Gaussian."""
+        """Return the Gaussian of z = G y + n from one Gaussian x of (state, r, y)."""
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         return from_columns(expected, join_columns(WeightedColumns(slopes, x.variances), noise))
 
@@ -152,11 +150,12 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
 
 
 def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-    """Return E z, slopes and noise of z = G y + n, y the last m components.
+    """Return E z, the slopes of z in xi and its noise for z = G y + n, y the last m components of x: centre + rows xi.
 
-    G y: the mean gain gives the slopes, its spread is noise. `second`: E[y y'].
+    The mean gain makes the slopes; the gain's spread about it is noise beside n.
     """
-    centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
-    second = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
-    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second, centre))
-    return gain @ centre + link.mean[:, -1], gain @ rows, noise
+    centre, rows = x.mean[-m:], x.root[-m:]
+    gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
+    second_moment = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
+    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second_moment, centre))
+    return gain @ centre + offset, gain @ rows, noise

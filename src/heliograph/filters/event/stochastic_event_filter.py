@@ -68,11 +68,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> StochasticBelief:
-        """Return the prior.
-
-        `law`: probabilities of the link's modes; `reference`: what the sender compares y with; `moved`: whether a step
-        was predicted.
-        """
+        """Return the prior: of x, and of the link's modes (`law`); nothing was sent or predicted (`moved`) yet."""
         start = at(self.plant, 0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(
@@ -87,8 +83,10 @@ class StochasticEventFilter(AbstractSizedFilter):
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
-        rows = jnp.asarray(at(self.channel, k).transition)
-        law = jnp.where(state.moved, state.law @ rows, state.law)  # at the first step the modes have their initial law
+        transition = jnp.asarray(at(self.channel, k).transition)
+        law = jnp.where(
+            state.moved, state.law @ transition, state.law
+        )  # at the first step the modes have their initial law
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)
@@ -191,12 +189,13 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives.
 
-        `law` (M,): probabilities of the modes; `chance`: of each pattern of arrivals by mode. The spread is that of (G,
-        n), z = G y + n.
+        The spread is that of (G, n) in z = G y + n; `law` (M,): probabilities of the modes. `joint_probability` (M,
+        patterns): of a mode and a pattern in which all arrives.
         """
-        whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
+        joint_probability = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
-            jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
+            jnp.tensordot(joint_probability, jnp.asarray(moment), 2) / jnp.sum(joint_probability)
+            for moment in (channel.mean, channel.spread)
         )
         return gain[:, :-1], spread
 
@@ -226,11 +225,10 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
-        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z.
+        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z; no less than log FLOOR, FLOOR 1e-6.
 
-        z = gain y + noise has the innovation `value`, of this covariance; silence is by y and the reference.
-
-        FLOOR: least probability, 1e-6. The noise is what the innovation's covariance has beside that of gain y.
+        z = gain y + noise has the innovation `value`, of this covariance; the noise is what it has beside that of
+        gain y. Silence depends on y and on the reference.
         """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
@@ -244,8 +242,8 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> tuple[jax.Array, Gaussian]:
         """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise.
 
-        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v, and
-        x = mean + L xi. The normaliser makes the density of r the probability of silence.
+        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v,
+        and x = mean + L xi. The density of r times a constant (the normaliser) is the probability of silence.
         """
         noise = join_columns(noise, eliminate(self._inverse_weight()))
         after, innovations = condition_on_observation(x, slopes, reference - expected, noise)

@@ -65,10 +65,12 @@ class Unscented(AbstractTransform):
         alpha, beta, kappa = float(self.alpha), float(self.beta), float(self.kappa)
         if n + kappa <= 0:
             raise fail("kappa", f"more than {-n} for {n} states", kappa)
-        size = alpha**2 * abs(kappa) + abs(beta) * n
-        if alpha**2 * kappa + beta * n < -ROUNDING * size:
-            least = 0.0 - beta * n / alpha**2
-            raise fail("kappa", f"at least {least:g} for {n} states, so that no covariance is indefinite", kappa)
+        sum_of_terms = alpha**2 * abs(kappa) + abs(beta) * n
+        if alpha**2 * kappa + beta * n < -ROUNDING * sum_of_terms:
+            smallest_kappa = 0.0 - beta * n / alpha**2
+            raise fail(
+                "kappa", f"at least {smallest_kappa:g} for {n} states, so that no covariance is indefinite", kappa
+            )
 
     def image(self, function: Function, x: Gaussian) -> Image:
         """Return the moments of f(x) from its values at the mean and the 2 n points.

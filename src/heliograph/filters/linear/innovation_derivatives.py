@@ -81,7 +81,12 @@ def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool
         x: the free numbers (p,).
         known_gain: whether the gain is known, so that no moment before data matters.
     """
-    slopes = tuple(jax.jvp(lambda x: _find_initial_moments(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x)))
+
+    def find_moments(x: Array) -> PyTree:
+        """Return the initial moments of the filter with the free numbers x."""
+        return _find_initial_moments(make(x))
+
+    slopes = tuple(jax.jvp(find_moments, (x,), (axis,))[1] for axis in np.eye(len(x)))
     start = jax.tree.map(jnp.asarray, make(x).init())
     if known_gain:
         return EstimateWithDerivatives(start.gaussian, slopes)

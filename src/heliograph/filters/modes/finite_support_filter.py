@@ -122,10 +122,9 @@ class MixtureFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> MixtureBelief:
-        """Return the prior, and the initial law of the modes."""
+        """Return the prior, and the initial law of the modes; `moved`: no step was predicted yet."""
         start = at(self.plant, 0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
-        # moved: no step was predicted
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
     @predicts
@@ -193,16 +192,16 @@ class MixtureFilter(AbstractSizedFilter):
         return smoother_step_of(step, (slopes, noise), "nominal", plant.manifold)
 
 
-def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
+def drop_below_point_mass(log_likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
     """Return log-likelihoods, -inf for combinations whose density another one's point mass outweighs.
 
     `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
     density is negligible.
     """
-    agrees = jnp.isfinite(likelihood)
+    agrees = jnp.isfinite(log_likelihood)
     # -1: no combination agrees with z.
-    most = jnp.max(jnp.where(agrees, certain, -1))
-    return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
+    largest_count = jnp.max(jnp.where(agrees, certain, -1))
+    return jnp.where(agrees & (certain < largest_count), -jnp.inf, log_likelihood)
 
 
 @accept_limits

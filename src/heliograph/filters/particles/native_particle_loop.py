@@ -173,7 +173,7 @@ def _compile_in_place(
 
 def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
     """Return the compiled function(filter, *arguments), to be called with the arguments; None without native code."""
-    choice = choose_code(function, (filter, *arguments), [False, *differs])
+    choice = choose_code(function, (filter, *arguments), differs_by_run=[False, *differs])
     if choice.code is None:
         return None
     return choice.code.with_first_arguments(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
@@ -277,7 +277,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
     ]
     sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
-    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
+    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), differs_by_run=[False, True, True])
     if outputs.code is None:
         return None
     return ScanResult(loop.last_state(last_key), outputs.results())

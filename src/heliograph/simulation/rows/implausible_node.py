@@ -85,7 +85,7 @@ def _judge_rows(
         states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
         arguments = filter, states, z, u[rows], rows
         with jax.enable_x64(True):
-            code = choose_code(_judge_filter_step, arguments, (False, True, True, True, True))
+            code = choose_code(_judge_filter_step, arguments, differs_by_run=(False, True, True, True, True))
             judgement = to_numpy(_judge_by_xla(*arguments, len(rows)) if code.code is None else code.results())
         votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
     return np.stack(votes, axis=1)

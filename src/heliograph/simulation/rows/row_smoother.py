@@ -260,7 +260,7 @@ class RowSmoother:
         if key not in self._programs:
             # Rows from `begin` to `stop`; no argument has an axis of runs, since there is one run alone.
             span = np.zeros(2, dtype=np.int32)
-            choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
+            choice = choose_code(self._run, (self._numbers, history, span), differs_by_run=[False] * 3)
             if choice.code is None:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:

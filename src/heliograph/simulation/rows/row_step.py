@@ -132,7 +132,7 @@ class RowStep:
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
-        self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), (False, True))
+        self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), differs_by_run=(False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first_arguments(*self._numbers)
 

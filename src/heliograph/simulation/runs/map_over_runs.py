@@ -44,7 +44,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Native code where it supports the function.
-    choice = choose_code(function, values, [True] * len(values))
+    choice = choose_code(function, values, differs_by_run=[True] * len(values))
     return choice.results() if choice.code is not None else _apply_by_xla(function, values, width)
 
 
