@@ -25,9 +25,10 @@ def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: in
 
     `begin`: first rows of the windows; the first ones follow one another within the data, and need no copy.
     """
-    total, place = len(jax.tree.leaves(rows)[0]), np.arange(len(begin)) * length
-    views = int(np.sum((begin == place) & (place + length <= total)))
-    for which in (slice(views), slice(views, None)):
+    total = len(jax.tree.leaves(rows)[0])
+    begin_if_adjacent = np.arange(len(begin)) * length
+    view_count = int(np.sum((begin == begin_if_adjacent) & (begin_if_adjacent + length <= total)))
+    for which in (slice(view_count), slice(view_count, None)):
         if len(first := begin[which]):
             yield WindowBatch(which, first, take_windows(rows, first, length))
 
@@ -58,26 +59,25 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
             blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
             return np.asarray(blocks[begin // length])
         windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
-        for window, place in zip(windows, begin, strict=True):
-            part = leaf[place : place + length]
-            window[: len(part)] = part
+        for window, first_row in zip(windows, begin, strict=True):
+            available = leaf[first_row : first_row + length]
+            window[: len(available)] = available
             # Behind the end of the data the last row is repeated.
-            window[len(part) :] = leaf[-1]
+            window[len(available) :] = leaf[-1]
         return windows
 
     return jax.tree.map(take_from, rows)
 
 
 def run_and_join(
-    function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs_by_run: Sequence[bool]
+    function: Callable[..., PyTree], calls: Sequence[tuple[Any, ...]], differs_by_run: Sequence[bool]
 ) -> PyTree:
-    """Return the results of runs of several lists of arguments in the same arrays; None without native code.
+    """Return the results of several calls, each of several runs, in the same arrays; None without native code.
 
-    `differs_by_run` says of which arguments each run has its own.
-
-    Lists of arguments differ in length of the axis of runs; the same compiled code computes all.
+    `calls`: arguments of each; they differ in the number of runs, and the same compiled code computes all.
+    `differs_by_run`: which arguments each run has its own of.
     """
-    choices = [choose_code(function, arguments, differs_by_run=differs_by_run) for arguments in parts]
+    choices = [choose_code(function, arguments, differs_by_run=differs_by_run) for arguments in calls]
     codes = [choice.code for choice in choices]
     return None if None in codes else codes[0].compute_calls([choice.arrays for choice in choices])
 

@@ -82,7 +82,7 @@ def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool
         known_gain: whether the gain is known, so that no moment before data matters.
     """
 
-    def find_moments(x: Array) -> PyTree:
+    def find_moments(x: Array) -> MomentSlopes:
         """Return the initial moments of the filter with the free numbers x."""
         return _find_initial_moments(make(x))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.precomputed_filter import LinearStep, PlannedFilter
-from heliograph.filters.modes.jump_linear_filter import ChannelByMode, channels_by_mode
+from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link

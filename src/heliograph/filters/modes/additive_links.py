@@ -29,11 +29,10 @@ from heliograph.factors.covariance_factors import (
 from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.filters.modes.jump_linear_filter import (
     AbstractModalFilter,
-    ChannelByMode,
     MeasurementModel,
-    channels_by_mode,
     claim_of_modes,
     concatenate_modes,
     condition_modes_on_received,

@@ -23,12 +23,9 @@ from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, se
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern
-from heliograph.filters.modes.mixing import align_angles
+from heliograph.filters.modes.mixing import align_angles, replicate
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
-from heliograph.filters.modes.multiple_model import (
-    correct_in_every_mode,
-    replicate,
-)
+from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.particles.factory import build_partly_drawn
 from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
@@ -122,11 +119,12 @@ class ParticleFilter(AbstractSizedFilter):
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
-        rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
-        drawn = jax.vmap(invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
+        transition = jnp.asarray(at(self.channel, k).transition)[state.mode]
+        uniform = jax.random.uniform(key, state.weight.shape, state.weight.dtype)
+        drawn_mode = jax.vmap(invert_distribution)(transition, uniform)
         start = second_moments_at_start(self.plant)
         parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
-        mode = jnp.where(state.moved, drawn, state.mode)
+        mode = jnp.where(state.moved, drawn_mode, state.mode)
         parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
         return Particles(gaussian=parts, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
 

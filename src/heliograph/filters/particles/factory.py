@@ -85,10 +85,10 @@ def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> 
     """Return the indices of the drawn states, in the plant's order; of all states for None."""
     if drawn is None:
         return tuple(range(len(start.states)))
-    asked = [str(name) for name in items("drawn", drawn, "names of states")]
-    if not set(asked) <= set(start.states) or len(set(asked)) < len(asked):
-        raise fail("drawn", f"some of {list(start.states)}, each once", asked)
-    return tuple(i for i, name in enumerate(start.states) if name in asked)
+    wanted = [str(name) for name in items("drawn", drawn, "names of states")]
+    if not set(wanted) <= set(start.states) or len(set(wanted)) < len(wanted):
+        raise fail("drawn", f"some of {list(start.states)}, each once", wanted)
+    return tuple(i for i, name in enumerate(start.states) if name in wanted)
 
 
 def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:

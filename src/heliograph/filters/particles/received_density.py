@@ -78,8 +78,9 @@ class ReceivedAtoms(Module):
         """
         weight, offset = jnp.asarray(self.weight), jnp.asarray(self.offset)
         mean = weight @ offset
-        noise = jnp.einsum("a,aij->ij", weight, jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset))
-        return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, noise - jnp.outer(mean, mean)
+        second = jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset)  # E[n n'] of each atom
+        covariance = jnp.einsum("a,aij->ij", weight, second) - jnp.outer(mean, mean)
+        return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, covariance
 
 
 class ReceivedDensity(Module):
@@ -93,13 +94,13 @@ class ReceivedDensity(Module):
     atoms: ReceivedAtoms
 
     def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
-        """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode.
+        """Return the atoms, and the chance (M,), of the smallest set of arrivals that holds all that arrived, by mode.
 
-        Atoms: the Gaussians of what arrives, by mode and set of arrivals; the chance: of such a set.
+        Atoms: the Gaussians whose mixture is what arrives, by mode and set of arrivals.
         """
-        kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
-        chosen: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
-        return chosen, jnp.asarray(self.chance)[:, kind]
+        pattern = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
+        atoms: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, pattern], self.atoms)
+        return atoms, jnp.asarray(self.chance)[:, pattern]
 
 
 def find_received_density(
@@ -160,7 +161,8 @@ def _check_noise(covariance: np.ndarray) -> None:
     CERTAIN: 1e-14, the eigenvalue of the noise's correlations up to which a combination has no noise.
     """
     deviation = np.sqrt(np.diagonal(covariance))
-    correlation = covariance / np.outer(*[np.where(deviation > 0, deviation, 1.0)] * 2)
+    unit = np.where(deviation > 0, deviation, 1.0)
+    correlation = covariance / np.outer(unit, unit)
     if len(covariance) and not np.min(np.linalg.eigvalsh(correlation)) > CERTAIN:
         expected = "noise in everything that arrives, so that it has a density (give the sensor or the link a variance)"
         raise fail("output of particles", expected, f"the covariance {covariance.tolist()}")
@@ -171,6 +173,7 @@ def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
 
     An atom is one Gaussian of what arrives. Weights are divided by their sum.
     """
-    filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
-    weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
+    padded = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
+    fields = zip(*padded, strict=True)
+    weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in field]) for field in fields)
     return ReceivedAtoms(weight=weight / weight.sum(), gain=gain, offset=offset, noise=noise)

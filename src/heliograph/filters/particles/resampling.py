@@ -21,17 +21,16 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 def resample_concrete_weights(weight: np.ndarray, start: float) -> np.ndarray:
     """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
 
-    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; and of a j the
-    index is the count of those drawn for lower ones alone.
-
-    start in [0, 1): the one random number of systematic resampling.
+    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; of draw j the
+    index is the count of particles drawn for lower j alone. `start` in [0, 1): the one random number of systematic
+    resampling.
     """
     count, ends = len(weight), np.cumsum(weight)
     ends *= count / ends[-1]
     ends += 1 - start
-    places = np.minimum(ends.astype(np.int64), count)
-    places[-1] = count  # whatever rounding says
-    return np.cumsum(np.bincount(places)[:count])
+    count_below = np.minimum(ends.astype(np.int64), count)
+    count_below[-1] = count  # whatever rounding says
+    return np.cumsum(np.bincount(count_below)[:count])
 
 
 def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
@@ -45,14 +44,16 @@ def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles
     MANY: 10,000; STEP: 2^-22, between two of the uniform numbers.
     """
     if size * particles < MANY:
-        least = np.nextafter(-1.0, 0.0)
-        uniform = jnp.maximum(least, 2 * draw_uniforms(key, numbers, size, particles) + least)
+        smallest = np.nextafter(-1.0, 0.0)
+        uniform = jnp.maximum(smallest, 2 * draw_uniforms(key, numbers, size, particles) + smallest)
         # Uniform on (-1, 1), of which the inverse error function makes normal numbers.
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
     words = draw_random_bits(key, numbers, -(-size // 2), particles)
-    halves = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
+    words_of_32_bits = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
     # The middles of 2^23 parts of (-1, 1).
-    uniform = (halves >> 9).astype(jnp.int32).astype(jnp.float32) * np.float32(STEP) + np.float32(STEP / 2 - 1)
+    uniform = (words_of_32_bits >> 9).astype(jnp.int32).astype(jnp.float32) * np.float32(STEP) + np.float32(
+        STEP / 2 - 1
+    )
     return (np.float32(np.sqrt(2)) * jax.lax.erf_inv(uniform)).astype(float)
 
 
@@ -68,8 +69,8 @@ def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, parti
     if numbers is None:
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
     # The place of each word among those of all particles, which is folded into the key: two halves of 32 bits.
-    places = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
-    halves = jax.vmap(jax.vmap(lambda place: jax.random.fold_in(key, place)))(places).astype(jnp.uint64)
+    positions = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
+    halves = jax.vmap(jax.vmap(lambda position: jax.random.fold_in(key, position)))(positions).astype(jnp.uint64)
     return halves[..., 0] << np.uint64(32) | halves[..., 1]
 
 

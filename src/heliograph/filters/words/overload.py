@@ -65,12 +65,11 @@ class Overload(NamedTuple):
             filter: name of the filter.
         """
         share, bound = float(np.max(self.probability)), float(self.bound)
-        often = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
+        frequency = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
         if not np.isfinite(bound):
-            return f"{often}, what that does to the claim of filter {filter!r} is not bounded"
-        return (
-            f"{often}, the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
-        )
+            return f"{frequency}, what that does to the claim of filter {filter!r} is not bounded"
+        error = f"the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
+        return f"{frequency}, {error}"
 
 
 def bound_overload(
@@ -143,7 +142,8 @@ def _find_models_of_step(
 
     `links`: moments of the link at each step, None where there is none.
     """
-    return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), None if links is None else links[k]
+    link = None if links is None else links[k]
+    return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), link
 
 
 @cache_by_object
@@ -250,9 +250,9 @@ def refuse_overload(overload: Overload) -> None:
     A word is overloaded if its number lies beyond the range. MOST: 1e-3; `bound`: share of the rms error, infinite if
     there is none.
     """
-    worst = float(np.max(overload.probability))
-    if worst > MOST:
+    largest = float(np.max(overload.probability))
+    if largest > MOST:
         bound = float(overload.bound)
-        off = f"; the claim may be off by {100 * bound:.3g}%" if np.isfinite(bound) else ""
+        consequence = f"; the claim may be off by {100 * bound:.3g}%" if np.isfinite(bound) else ""
         expected = "an overload in at most 1 of 1000 steps: widen low and high, or centre them (hg.model.centred)"
-        raise fail("range of the words", expected, f"{worst:.2g} a step{off}")
+        raise fail("range of the words", expected, f"{largest:.2g} a step{consequence}")
