@@ -129,8 +129,9 @@ class LinkWithScaledNoise(eqx.Module):
         """Return the link of these declared numbers, with its noise scaled."""
         link = self.make(numbers)
         # Class of the message: how many `edges` the mean logarithm of its variances is above.
-        size = jnp.mean(jnp.log(list_noise_variances(link)))
-        scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
+        log_variance = jnp.mean(jnp.log(list_noise_variances(link)))
+        class_number = jnp.sum(log_variance > jnp.asarray(self.edges))
+        scale = jnp.asarray(self.scales)[class_number]
 
         def rescale(leaf: object) -> object:
             """Return a noise with its covariance scaled; anything else as it is."""
@@ -153,16 +154,19 @@ def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares_noise(affine: ToldMap) -> bool:
-    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise.
+    """Return whether a map takes its Gaussian noise from the number it is told: another number gives another noise.
 
-    ALMOST: by which part of itself the number is moved. A map that is told its gain declares no noise.
+    ALMOST: by which part of itself the number is changed. A map that is told its gain declares no noise.
     """
     if isinstance(affine.make, ToldGainHop):
         return False
     typical = np.asarray(affine.typical)
-    noises, moved = (_list_link_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
-    changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
-    return changes and all(isinstance(noise, Gaussian) for noise in noises)
+    noises = _list_link_noises(affine.believed(typical))
+    changed_noises = _list_link_noises(affine.believed(typical * (1 + ALMOST)))
+    has_changed = any(
+        not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, changed_noises, strict=True)
+    )
+    return has_changed and all(isinstance(noise, Gaussian) for noise in noises)
 
 
 def _list_link_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
@@ -247,11 +251,13 @@ def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
 
     `scales`: the best without a bias, from which the search begins, once for each memory of TIMES in steps.
     """
-    step = find_median_step(declared)
-    white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
+    time_step = find_median_step(declared)
+    start_scales = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     # Behind the scales: the bias's deviation over the root of its memory, and its memory.
-    starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
-    return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+    log_deviation = (np.mean(scales.logs) - np.log(time_step)) / 2
+    starts = [np.append(start_scales, [log_deviation, np.log(memory * time_step)]) for memory in TIMES]
+    refits = [_maximise_likelihood(declared, start) for start in starts]
+    return max(refits, key=lambda refit: refit.likelihood)
 
 
 def find_median_step(declared: DeclaredRows) -> float:

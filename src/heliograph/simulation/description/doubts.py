@@ -96,7 +96,8 @@ def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
     """
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
-            yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
+            is_serious = not float(overload.bound) <= SEEN  # NaN too
+            yield Doubt(is_serious, overload.describe(name, label))
 
 
 def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
@@ -130,7 +131,7 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
-    yield from _doubt_error_bound(network, "the mean error of every filter", True)
+    yield from _doubt_error_bound(network, "the mean error of every filter", serious=True)
     alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
     if len(network.nodes) == 1 or not alone:
         return
@@ -139,9 +140,8 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
         return
     for name in alone:
         node = network.nodes[name]
-        yield from _doubt_error_bound(
-            Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused
-        )
+        alone_network = Network(network.plant, {name: node})
+        yield from _doubt_error_bound(alone_network, f"the mean error of {name!r} alone", serious=not network.fused)
 
 
 def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
@@ -188,13 +188,17 @@ def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
     names = []
     for name, node in network.nodes.items():
-        told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
-        if any(list_links_declaring_noise(one) for one in told):
+        told_filters = (
+            [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
+            if isinstance(node, Node)
+            else []
+        )
+        if any(list_links_declaring_noise(filter) for filter in told_filters):
             names.append(name)
     if names:
-        who = join_names([repr(name) for name in names])
+        senders = join_names([repr(name) for name in names])
         yield Doubt(
-            False, f"declared: noise is taken as the messages of {who} say it; `heliograph run --report` judges it"
+            False, f"declared: noise is taken as the messages of {senders} say it; `heliograph run --report` judges it"
         )
 
 
@@ -214,16 +218,18 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
 
     `forgetful`: nodes, by filter, where it ignores the memory of their links. `lowered`: the claim was lowered for it.
     """
-    alike: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
+    beliefs_by_words: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
-        alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
-    for (lowered, _, _), beliefs in alike.items():
-        more = f" (and at {join_names([repr(belief.node) for belief in beliefs[1:]])})" if len(beliefs) > 1 else ""
+        beliefs_by_words.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
+    for (lowered, _, _), beliefs in beliefs_by_words.items():
+        other_nodes = (
+            f" (and at {join_names([repr(belief.node) for belief in beliefs[1:]])})" if len(beliefs) > 1 else ""
+        )
         consequence = ", so that its claim is nominal" if lowered else ""
-        yield Doubt(lowered, f"another world: {beliefs[0].words}{more}{consequence}")
+        yield Doubt(lowered, f"another world: {beliefs[0].words}{other_nodes}{consequence}")
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:

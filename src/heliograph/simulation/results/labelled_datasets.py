@@ -37,8 +37,8 @@ def drop_unused_modes(modes: np.ndarray | None) -> np.ndarray | None:
     """
     if modes is None:
         return None
-    used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
-    return modes[..., used] if used.any() else None
+    is_used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
+    return modes[..., is_used] if is_used.any() else None
 
 
 TIME = "time"
