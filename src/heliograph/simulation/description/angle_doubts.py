@@ -50,9 +50,9 @@ def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
         for name, deviation in _yield_deviations(network, filter, covariance):
             if deviation > find_largest_usable_deviation(filter):
                 nodes_by_angle.setdefault((name, label, float(deviation)), []).append(node)
-    for (name, label, deviation), nodes in nodes_by_angle.items():
+    for (name, label, known), nodes in nodes_by_angle.items():
         first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
-        yield f"wide angle: {label!r} of {first_nodes} starts with {name!r} known to +- {deviation:.2g} rad; {REMEDY}"
+        yield f"wide angle: {label!r} of {first_nodes} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:

@@ -113,10 +113,11 @@ def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
     for node, name, quantity in values:
         if quantity == SENT[0]:
             nodes_of.setdefault(name, []).append(node)
-    return {
-        name: Uplink(tuple(nodes), *(np.stack([values[node, name, q] for node in nodes], axis=-2) for q in SENT))
-        for name, nodes in nodes_of.items()
-    }
+    uplinks = {}
+    for name, nodes in nodes_of.items():
+        sent = [np.stack([values[node, name, quantity] for node in nodes], axis=-2) for quantity in SENT]
+        uplinks[name] = Uplink(tuple(nodes), *sent)
+    return uplinks
 
 
 def _keep_labels(columns: Sequence[Column]) -> Any:

@@ -35,9 +35,10 @@ class RowHistory(NamedTuple):
 
         `held` has as many inputs as a row gives.
         """
-        given = self.held.shape[1]
+        inputs = self.held.shape[1]
         numbers = self.rows[row]
-        return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
+        measurements, u, time = numbers[: -inputs - 1], numbers[-inputs - 1 : -1], numbers[-1]
+        return measurements, u, time
 
     def state_after(self, row: jax.Array) -> PyTree:
         """Return the filters' states after a row."""
@@ -55,7 +56,7 @@ class RowHistory(NamedTuple):
         Between rows nothing is measured (NaN), and inputs are those held since the row before, as are inputs that the
         row does not give (NaN).
         """
-        received, given, step_of_row = self.read_row(row)
+        z, u_of_row, step_of_row = self.read_row(row)
         is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(is_row, jnp.where(jnp.isnan(given), held, given), held)
-        return jnp.where(is_row, received, jnp.nan), u
+        u = jnp.where(is_row, jnp.where(jnp.isnan(u_of_row), held, u_of_row), held)
+        return jnp.where(is_row, z, jnp.nan), u

@@ -45,10 +45,10 @@ class NetworkStep(Module):
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
-        """Hold the filters, and by group the places of each node's measurements among those of all nodes."""
-        rows = network.rows
+        """Hold the filters, and by group of nodes the indices of each node's components in the joined measurement."""
         self.filters = filters
-        self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
+        indices = {name: tuple(rows) for name, rows in network.rows.items()}
+        self.places = tuple(tuple(indices[name] for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, taken without implausible measurements, and the outputs.
@@ -58,7 +58,8 @@ class NetworkStep(Module):
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
-        after, outputs = step_plausibly(self.filters, state, self.group_measurements(received), u, k)
+        z = self.group_measurements(received)
+        after, outputs = step_plausibly(self.filters, state, z, u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
     def group_measurements(self, received: jax.Array) -> list[jax.Array]:
@@ -88,9 +89,10 @@ class RowLayout(NamedTuple):
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
         """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
-        known, rest = row[: self.state.size], row[self.state.size :]
-        u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
-        return self.state.tree(known), rest[: self.received], u, k
+        state, rest = row[: self.state.size], row[self.state.size :]
+        z, u = rest[: self.received], rest[self.received : self.received + self.inputs]
+        k = rest[-1].astype(np.int64)
+        return self.state.tree(state), z, u, k
 
 
 @readable
@@ -238,7 +240,7 @@ class OneRowStep:
         By native code, or by XLA where there is none (`_code` is None). The next call overwrites the result.
         """
         if self._code is None:
-            return self._steps(np.concatenate(parts, axis=1), True)
+            return self._steps(np.concatenate(parts, axis=1), alone=True)
         np.concatenate(parts, axis=1, out=self._code.inputs[0])
         self._code()
         stepped: np.ndarray = self._code.outputs[0]
@@ -287,7 +289,8 @@ def _make_row_function(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         """Step a row; return states and outputs side by side."""
-        return jnp.concatenate([flatten_to_row(tree) for tree in _make_step(layout)(numbers, row)])
+        states, outputs = _make_step(layout)(numbers, row)
+        return jnp.concatenate([flatten_to_row(states), flatten_to_row(outputs)])
 
     return step
 
@@ -325,9 +328,9 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
             """Return `done` with the `together` rows of turn i stepped, in parallel, at their places."""
-            some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
-            stepped = jax.vmap(lambda row: step(numbers, row))(some)
-            return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
+            rows_of_turn = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
+            stepped = jax.vmap(lambda row: step(numbers, row))(rows_of_turn)
+            return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, axis=0)
 
         columns = layout.state.size + outputs.size
         stepped: jax.Array = jax.lax.fori_loop(0, turns, step_rows, jnp.zeros((width, columns)))

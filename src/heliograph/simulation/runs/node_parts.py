@@ -33,8 +33,9 @@ def is_apart(network: Network) -> bool:
     Then a few nodes can be simulated by themselves, with the same results.
     """
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    fused = network.fused or network.meshes
-    return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
+    all_have_filters = len(nodes) == len(network.nodes)
+    are_fused = network.fused or network.meshes
+    return all_have_filters and not are_fused and not any(first(node.channel).remembers for node in nodes)
 
 
 @cache_by_object
@@ -62,11 +63,11 @@ def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
     """
     parts = []
     for names in network.groups:
-        alike = _select_nodes(network, names)
-        world = jax.tree.map(_on_host, build_world(alike))
+        network_of_group = _select_nodes(network, names)
+        world = jax.tree.map(_on_host, build_world(network_of_group))
         for start in range(0, len(names), NODES):
-            some = slice(start, start + NODES)
-            parts.append((_select_nodes(network, names[some]), _select_rows(world, some)))
+            part = slice(start, start + NODES)
+            parts.append((_select_nodes(network, names[part]), _select_rows(world, part)))
     return tuple(parts)
 
 
