@@ -49,8 +49,8 @@ class EngineChoice(NamedTuple):
         """Sentence "native: ..." with the number of operations, or "xla: ..." with `why` there is no native code."""
         if self.code is None:
             return f"xla: {self.why}"
-        slow = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
-        return f"native: {self.code.operations} operations{slow}"
+        divisions = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
+        return f"native: {self.code.operations} operations{divisions}"
 
     def results(self) -> PyTree:
         """Run the code on the arrays."""
@@ -72,9 +72,8 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return choose_code(
-        function, jax.tree.map(np.asarray, arguments), differs_by_run=[True] * len(arguments)
-    ).explanation
+    arrays = jax.tree.map(np.asarray, arguments)
+    return choose_code(function, arrays, differs_by_run=[True] * len(arguments)).explanation
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
@@ -85,7 +84,7 @@ def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     if read_forced_engine() == "xla":
         return ""
     with jax.enable_x64(True):
-        return _find_compiled_code(function, arguments, [False] * len(arguments)).why
+        return _find_compiled_code(function, arguments, differs_by_run=[False] * len(arguments)).why
 
 
 def choose_code(
@@ -166,7 +165,8 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.refuse_forked_process()
-        returned: R = compute_once(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        arrays = jax.tree.map(float64.as_array, args)
+        returned: R = compute_once(function, by_xla, arrays, most=SHORT)
         return returned
 
     return call
@@ -278,8 +278,8 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 
         The tree (`structure`) is (function, *arguments): also the function may hold arrays.
         """
-        items = iter(values)
-        with_values = [next(items) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
+        next_value = iter(values)
+        with_values = [next(next_value) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
         function, *arguments = jax.tree.unflatten(structure, with_values)
         return function(*arguments)
 

@@ -143,7 +143,8 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
         return None
     # Where rows are more of a recording, they begin at its last states and step.
     begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
-    filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
+    recursion = NetworkRecursion(task.filters, begin.step)
+    filtered = scan_in_chunks(recursion, to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
 
 
@@ -190,12 +191,12 @@ def _scan_rows(
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         """Return the states of all filters after one row, and what they made of it.
 
-        The row: step, inputs, measurements, what arrived, and a flag. False leaves the states as they are, as rows
-        that only fill up a scan do; None: all rows count. `judged`: what is implausible is left out.
+        The row: step, inputs, measurements, what arrived of reports, and a flag: False leaves the states as they are,
+        as for rows that only fill up a scan; None: all rows count. `judged`: what is implausible is left out.
         """
-        (k, u_k, z_k, drawn), row_is_counted = row
+        (k, u_k, z_k, arrivals), row_is_counted = row
         step = step_plausibly if judged else AllFilters.step
-        after, results = step(filters, states, z_k, u_k, k, drawn)
+        after, results = step(filters, states, z_k, u_k, k, arrivals)
         if row_is_counted is not None:
             after = jax.tree.map(lambda new, old: jnp.where(row_is_counted, new, old), after, states)
         return after, results
@@ -213,7 +214,8 @@ def _collect_results(
     """
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
+    smoothed = results if smoother is None else smoother.smooth_run(results)
+    return smoothed | judged | {"state": state}
 
 
 def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
@@ -232,8 +234,8 @@ def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> P
 
         The row: step, inputs, measurements, and what arrived of reports.
         """
-        k, u_k, z_k, drawn = row
-        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, drawn)
+        k, u_k, z_k, arrivals = row
+        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, arrivals)
         _, central, *_ = states
         return after, central
 

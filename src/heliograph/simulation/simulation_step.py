@@ -43,7 +43,7 @@ class World(Module):
         if isinstance(plant, ModalPlant) and plant.rates is not None:
             expected = "transitions of a plant's modes by steps (with rates filter recordings, simulate T = exp(G dt))"
             raise fail("simulation", expected, "rates of switches")
-        x = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL))
+        x = plant.sample_initial(draw_key(key, k=0, source=WORLD, purpose=INITIAL))
         modes = start_modes(plant, key, self._memory_numbers)
         edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
         return x, self.medium.init(key), self.filters.init(), edges, modes

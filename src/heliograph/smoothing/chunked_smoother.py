@@ -55,7 +55,9 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
         return None
     with jax.enable_x64(True):
         begun = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
-        return None if begun is None else _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
+        if begun is None:
+            return None
+        return _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
 
 
 def smooth_chunk(
@@ -131,8 +133,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         else:
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
-        differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
-        choice = choose_code(smooth_chunk, arguments, differs_by_run=differs_by_chunk)
+        all_but_recursion = [False, True, True, True, True, True, True]
+        choice = choose_code(smooth_chunk, arguments, differs_by_run=all_but_recursion)
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:
@@ -163,13 +165,13 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
     with which the chunk before it has to agree. Filtering begins in the state in which the chunk before ends, of the
     first one in that of `states`.
     """
-    wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
-    for c in range(len(wrong) - 1, -1, -1):
-        if not wrong[c]:
+    disagrees_with_next = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
+    for chunk in range(len(disagrees_with_next) - 1, -1, -1):
+        if not disagrees_with_next[chunk]:
             continue
-        before, here, behind = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
-        state = take(results.end, before) if c else take(states, here)
-        replace_chunk(results, here, smooth(state, here, take(results.left, behind)))
-        if c:
-            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, here))
-            wrong[c - 1] = not agrees
+        before, this, after = slice(chunk - 1, chunk), slice(chunk, chunk + 1), slice(chunk + 1, chunk + 2)
+        state = take(results.end, before) if chunk else take(states, this)
+        replace_chunk(results, this, smooth(state, this, take(results.left, after)))
+        if chunk:
+            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, this))
+            disagrees_with_next[chunk - 1] = not agrees

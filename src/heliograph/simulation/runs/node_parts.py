@@ -96,10 +96,11 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
 
 def _with_fields(module: M, **changed: object) -> M:
     """Return a copy of a module with these fields changed, without its constructor, which would compute them."""
-    new = object.__new__(type(module))
+    changed_copy = object.__new__(type(module))
     for field in fields(module):
-        object.__setattr__(new, field.name, changed.get(field.name, getattr(module, field.name)))
-    return new
+        value = changed.get(field.name, getattr(module, field.name))
+        object.__setattr__(changed_copy, field.name, value)  # fields are frozen
+    return changed_copy
 
 
 def _select_rows(world: World, nodes: slice) -> World:

@@ -89,7 +89,8 @@ def get_weighed_components(innovation: Innovation) -> Weighed | None:
     """
     if innovation.weight is None:
         return None
-    return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
+    variance = jnp.diagonal(innovation.covariance)
+    return Weighed(jnp.asarray(innovation.value), variance, jnp.asarray(innovation.weight))
 
 
 class StackedFilters(Module):
@@ -155,10 +156,13 @@ class StackedFilters(Module):
     def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
         """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
         rows = slice(f * self.nodes, (f + 1) * self.nodes)  # all nodes of the first filter stand first, and so on
-        taken: tuple[AbstractFilter, PyTree] = jax.tree.map(
-            lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states)
-        )
-        return taken
+
+        def take_rows(leaf: PyTree) -> PyTree:
+            """Return the rows of an array, anything else as it is."""
+            return leaf[rows] if eqx.is_array(leaf) else leaf
+
+        filter, state = jax.tree.map(take_rows, (self.filters, states))
+        return filter, state
 
 
 def initial_state(filter: AbstractFilter) -> PyTree:

@@ -166,12 +166,13 @@ def _receive_sum(
         sent: signal of each sender, by name.
         key: of the run.
     """
-    parts = []
+    received = []
     for sender, hop in hops.items():
         if not first(hop).remembers:  # its state is ()
-            _, z = deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())
-            parts.append(z)
-    if parts:
-        return jnp.sum(jnp.stack(parts), axis=0)
+            source = checksum(f"{sender} to {listener}")
+            _, z = deliver_signal(hop, (), sent[sender], key, k, source, shared=())
+            received.append(z)
+    if received:
+        return jnp.sum(jnp.stack(received), axis=0)
     # Hops with memory alone are added elsewhere.
     return jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
