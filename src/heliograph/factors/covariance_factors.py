@@ -206,12 +206,12 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
     return factor(covariance, least_pivots)
 
 
-def _eliminate_column_by_column(covariance: jax.Array, least_pivots: jax.Array) -> WeightedColumns:
-    """Return L and d with L diag(d) L' = P, by elimination without square roots, no d below `least_pivots` (n,)."""
+def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
+    """Return L and d with L diag(d) L' = P, by elimination without square roots, no d below `least` (n,)."""
     n, remainder, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
         column = lax.index_in_dim(remainder, j, axis=1, keepdims=False)
-        variances.append(_bound_below(column[j], least_pivots[j]))
+        variances.append(_bound_below(column[j], least[j]))
         reciprocal = lax.reshape(reciprocal_or_zero(variances[j]), (1,))
         multiples = column_below_diagonal(j, outer(column, reciprocal))  # column j of L
         remainder = symmetric(remainder - outer(multiples, column))

@@ -88,19 +88,18 @@ def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
     """Return the Laguerre function L_v(-x) = 1F1(-v; 1; -x) of order v = `twice_order` / 2 >= 0 at -x <= 0.
 
     By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
-    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) =
-    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. Below: `before` is
-    L_(v-1), `now` L_v.
+    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x)
+    I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. `previous` is L_(v-1), `current` L_v.
     """
     if twice_order % 2:
         bessel = scipy_for(x).special
-        before = bessel.i0e(x / 2)
-        now, v = (1 + x) * before + x * bessel.i1e(x / 2), 0.5
+        previous = bessel.i0e(x / 2)
+        current, v = (1 + x) * previous + x * bessel.i1e(x / 2), 0.5
     else:
-        before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
+        previous, current, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
     while v < twice_order / 2:
-        before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
-    moment: Scalar = now
+        previous, current, v = current, ((2 * v + 1 + x) * current - v * previous) / (v + 1), v + 1
+    moment: Scalar = current
     return moment
 
 
@@ -127,9 +126,9 @@ class Nakagami(AbstractLaw):
 
     def quantile(self, probability: Vector) -> np.ndarray:
         """Return the gains below which the law has these probabilities: roots of the quantiles of g^2, a gamma law."""
-        return np.asarray(
-            np.sqrt(scipy.special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
-        )
+        m, power = float(self.shape), float(self.power)
+        squares = scipy.special.gammaincinv(m, probability) * power / m
+        return np.asarray(np.sqrt(squares))
 
     def log_density(self, g: jax.Array) -> jax.Array:
         """Return (2 m - 1) log(g) - m g^2 / power."""

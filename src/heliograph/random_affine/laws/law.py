@@ -187,10 +187,11 @@ class Discrete(AbstractLaw):
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)
         high = np.minimum(self.probabilities + self.radius, 1.0)
-        mass, total = 1.0 - low.sum(), float(low @ gain)
-        for i in np.argsort(-gain, kind="stable"):
-            added = min(mass, high[i] - low[i])
-            total, mass = total + added * gain[i], mass - added
+        mass_left, total = 1.0 - low.sum(), float(low @ gain)
+        largest_first = np.argsort(-gain, kind="stable")
+        for i in largest_first:
+            added = min(mass_left, high[i] - low[i])
+            total, mass_left = total + added * gain[i], mass_left - added
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
@@ -294,8 +295,8 @@ class GivenMoments(AbstractLaw):
         half = (len(sequence) - 1) // 2
         # Moments of a distribution have a positive semidefinite Hankel matrix E[V V'], V = (1, g, g^2, ...).
         hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
-        scale = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
-        smallest = np.linalg.eigvalsh(hankel / np.outer(scale, scale))[0]
+        root_of_diagonal = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
+        smallest = np.linalg.eigvalsh(hankel / np.outer(root_of_diagonal, root_of_diagonal))[0]
         if np.any(np.diag(hankel) < 0) or smallest < -1e-10:  # rounding of a correlation matrix
             raise fail("gain moments", "those of some distribution", f"{self.moments.tolist()}, which none has")
 

@@ -59,8 +59,8 @@ def factor_variables(variables: int, degree: int) -> np.ndarray:
     Monomials, and variables in each, in the order of `list_exponents`.
     """
     choices = combinations_with_replacement(range(variables), degree)
-    flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
-    return flat.reshape(count_monomials(variables, degree), degree)
+    all_variables = np.fromiter((variable for choice in choices for variable in choice), np.int64)
+    return all_variables.reshape(count_monomials(variables, degree), degree)
 
 
 def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
@@ -70,13 +70,13 @@ def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
     same variables before the t-th, and a smaller t-th.
     """
     ordered = np.sort(chosen, axis=-1)
-    before = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
+    previous = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
     rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
     for t in range(chosen.shape[-1]):
-        # counts[n]: monomials of the `rest` variables from the t-th on among the last n variables.
-        rest = chosen.shape[-1] - t
-        counts = np.array([count_monomials(n, rest) for n in range(variables + 1)])
-        rank += counts[variables - before[..., t]] - counts[variables - before[..., t + 1]]
+        # counts[n]: monomials that the variables from the t-th on can be, among the last n variables.
+        variables_left = chosen.shape[-1] - t
+        counts = np.array([count_monomials(n, variables_left) for n in range(variables + 1)])
+        rank += counts[variables - previous[..., t]] - counts[variables - previous[..., t + 1]]
     return rank
 
 
@@ -93,13 +93,15 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
     NumPy's where y is, else JAX's.
     """
     values: list[Numbers] = [*y, 1.0]
-    terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
-             for powers in list_exponents(len(values), degree)]  # fmt: skip
+    terms = []
+    for powers in list_exponents(len(values), degree):
+        factors = (value**power for value, power in zip(values, powers, strict=True) if power)
+        terms.append(prod(factors, start=1.0))
     if isinstance(y, np.ndarray):
         return np.array(terms, dtype=np.float64)
     import jax.numpy as jnp
 
-    return jnp.stack([jnp.asarray(t, dtype=float) for t in terms])
+    return jnp.stack([jnp.asarray(term, dtype=float) for term in terms])
 
 
 @cache_arrays
@@ -121,9 +123,8 @@ def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
 def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial the last variable that divides it, and the quotient's position at degree - 1."""
     table = _tabulate_quotient_positions(variables, degree)
-    divisor = np.array(
-        [max(c for c, power in enumerate(powers) if power) for powers in list_exponents(variables, degree)]
-    )
+    exponents = list_exponents(variables, degree)
+    divisor = np.array([max(c for c, power in enumerate(powers) if power) for powers in exponents])
     return divisor, table[np.arange(len(divisor)), divisor]
 
 
@@ -163,8 +164,9 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
-    both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
-    return place_monomials(np.concatenate(both, axis=-1), variables)
+    of_a = np.broadcast_to(a[:, None], (*shape, first))
+    of_b = np.broadcast_to(b, (*shape, second))
+    return place_monomials(np.concatenate([of_a, of_b], axis=-1), variables)
 
 
 def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
@@ -197,15 +199,16 @@ def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarr
     For all monomials a of (y, 1) of this order, y of `dimension`. Places are among these: b and a - b are times powers
     of 1.
     """
-    places, terms = position(dimension + 1, order), []
+    position_of, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
         for b in product(*(range(x + 1) for x in a)):
-            rest = tuple(x - y for x, y in zip(a, b, strict=True))
+            remainder = tuple(x - y for x, y in zip(a, b, strict=True))
             weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
-            terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
-    rows, columns, noises, weights = np.array(terms, dtype=np.int64).T
-    return rows, columns, noises, weights
+            column = position_of[(*b, order - sum(b))]
+            terms.append((row, column, position_of[(*remainder, order - sum(remainder))], weight))
+    rows, columns, remainders, weights = np.array(terms, dtype=np.int64).T
+    return rows, columns, remainders, weights
 
 
 class JointMoments(Module):
@@ -261,17 +264,17 @@ def times_one(variables: int, low: int, high: int) -> np.ndarray:
     return place_monomials(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
 
 
-def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
-    """Return a map's method `moments` (`written`), which may give a matrix alone, as one that gives `JointMoments`.
+def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
+    """Return a map's method `moments` (`own_method`), which may give a matrix alone, as one that gives `JointMoments`.
 
     Raises:
         ValueError: a matrix whose shape is not that of the map's monomials.
     """
 
-    @wraps(written)
+    @wraps(own_method)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from what the map's own method, `written`, returns: they or a matrix."""
-        result = written(channel, order)
+        """Return the moments of this order, from what the map's own method returns: they or a matrix."""
+        result = own_method(channel, order)
         if isinstance(result, JointMoments):
             return result
         shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)

@@ -168,11 +168,11 @@ class CentredNoise(AbstractNoise):
         """
         total: Number = 0.0
         for b in product(*(range(a + 1) for a in powers)):
-            weights = [
+            factors = [
                 comb(a_i, b_i) * plain((-self.source.mean[i]) ** (a_i - b_i))
                 for i, (a_i, b_i) in enumerate(zip(powers, b, strict=True))
             ]
-            total += prod(weights) * (self.source.moment(b) if any(b) else 1.0)
+            total += prod(factors) * (self.source.moment(b) if any(b) else 1.0)
         return total
 
 

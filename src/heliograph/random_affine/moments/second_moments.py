@@ -84,11 +84,12 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     """
     xp, covariance = library(spread), spread[..., -1, -1]
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
-    corner = np.zeros(spread.shape[-2:])
-    corner[-1, -1] = 1.0
-    # `corner` is where a spread has the covariance of n. Of the m columns some are zero if the covariance has fewer.
-    noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
-    return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
+    at_noise = np.zeros(spread.shape[-2:])
+    at_noise[-1, -1] = 1.0
+    # `at_noise` is 1 where a spread has the covariance of n.
+    split = xp.where(uncorrelated, covariance, 0.0)
+    noise = _pad_columns(columns_of(split))  # m columns, some of them zero if the covariance has fewer
+    return spread - split[..., None, None] * at_noise, noise
 
 
 def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
