@@ -152,8 +152,7 @@ class Gaussian(AbstractNoise):
         are_apart = group_of_component[:, None] != group_of_component
         if np.any(np.asarray(self.covariance)[are_apart]):
             return None
-        blocks = [np.ix_(group, group) for group in groups]
-        return [Gaussian(self.covariance[block], self.mean[block[0][:, 0]]) for block in blocks]
+        return [Gaussian(self.covariance[np.ix_(group, group)], self.mean[np.asarray(group)]) for group in groups]
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw mean + A e with e normal of variances w."""
@@ -221,8 +220,8 @@ class FiniteSupport(AbstractNoise):
         self.atoms = array("noise atoms", atoms, ("atoms", "components"))
         self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
-        centred = self.atoms - self.mean
-        self.covariance = centred.T @ (self.probabilities[:, None] * centred)
+        deviations = self.atoms - self.mean
+        self.covariance = deviations.T @ (self.probabilities[:, None] * deviations)
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return the values with their probabilities, each a point: of covariance 0 about it."""
@@ -250,18 +249,18 @@ class Independent(AbstractNoise):
         self.parts = tuple(items("independent noises", parts, "laws"))
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
-        if others := [component for component in self.parts if not isinstance(component, AbstractNoise)]:
+        if others := [part for part in self.parts if not isinstance(part, AbstractNoise)]:
             raise fail("independent noises", "laws of a noise vector", show_value(others[0]))
-        means, blocks = [component.mean for component in self.parts], [component.covariance for component in self.parts]
+        means, covariances = [part.mean for part in self.parts], [part.covariance for part in self.parts]
         self.mean = library(means).concatenate(means)
-        self.covariance = block_diagonal(blocks)
+        self.covariance = block_diagonal(covariances)
 
     @property
     def columns(self) -> WeightedColumns:
         """Columns A and weights w with covariance A diag(w) A': those of the parts, one after another."""
-        parts = [component.columns for component in self.parts]
-        matrices = [part.matrix for part in parts]
-        weights = library(parts).concatenate([part.weights for part in parts])
+        columns_by_part = [part.columns for part in self.parts]
+        matrices = [columns.matrix for columns in columns_by_part]
+        weights = library(columns_by_part).concatenate([columns.weights for columns in columns_by_part])
         return WeightedColumns(block_diagonal(matrices), weights)
 
     @property
@@ -280,9 +279,9 @@ class Independent(AbstractNoise):
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return mean and covariance of the independent parts without their outliers, one above the other."""
-        parts = [component.without_outliers() for component in self.parts]
-        mean = library(parts).concatenate([part.mean for part in parts])
-        return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))
+        inliers = [part.without_outliers() for part in self.parts]
+        mean = library(inliers).concatenate([noise.mean for noise in inliers])
+        return NoiseWithoutOutliers(mean, block_diagonal([noise.covariance for noise in inliers]))
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return every atom of each part with every one of the others."""
@@ -311,10 +310,10 @@ class Independent(AbstractNoise):
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a], the product of E[n_part^a_part] over the independent parts; `powers`: a, by component."""
         product: Number = 1.0
-        left = iter(powers)
-        for component in self.parts:
-            exponents = tuple(islice(left, component.dimension))
-            product *= component.moment(exponents) if any(exponents) else 1.0
+        next_powers = iter(powers)
+        for part in self.parts:
+            exponents = tuple(islice(next_powers, part.dimension))
+            product *= part.moment(exponents) if any(exponents) else 1.0
         return product
 
 

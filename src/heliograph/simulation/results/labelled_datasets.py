@@ -142,7 +142,7 @@ class FilterLabels:
     def list_placed(self, read: Callable[[Any], T]) -> list[Placed[T]]:
         """Return what `read` gives of each result, with the result's place (number of node, number of filter)."""
         filters = self.filters
-        placed = []
+        placed: list[Placed[T]] = []
         for node, by_filter in self.by_node.items():
             for name, result in by_filter.items():
                 placed.append(((self.nodes.index(node), filters.index(name)), read(result)))

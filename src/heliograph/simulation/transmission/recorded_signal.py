@@ -60,7 +60,7 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-        """Return the channel's next state, and what arrives of y in row k; `matrix`: [G n; 0 1], the channel as drawn."""
+        """Return the channel's next state, and what arrives of y in row k; `matrix`: the drawn [G n; 0 1]."""
         k, y_k = row
         is_missing = jnp.isnan(y_k)
         state, matrix = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
