@@ -126,8 +126,8 @@ class AbstractRandomAffine(Module):
         if self.remembers:
             what = f"sample of {type(self).__name__}"
             raise fail(what, "a map that forgets", "one that remembers; use init and draw")
-            _, matrix = self.draw((), key)
-            return matrix
+        _, matrix = self.draw((), key)
+        return matrix
 
     def moments(self, order: int) -> JointMoments:
         """Return the nominal E[Sym^order(H)], which takes monomials of (y, 1) to means of those of (z, 1).

@@ -211,8 +211,8 @@ def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
         _, smoother_step = eqx.filter_eval_shape(
             lambda filter, state: filter.step_with_smoother(state, z, u, k=0), filter, state
         )
-        claim: Claim = smoother_step.claim
-        return claim
+    claim: Claim = smoother_step.claim
+    return claim
 
 
 def _find_claim_of_fusion(network: Network, name: str, fusion: Fusion | AbstractFilter, claims: Claims) -> Claim:
