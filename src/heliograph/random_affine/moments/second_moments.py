@@ -186,8 +186,8 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     # A single corner: nothing is uncertain.
     if corners == 1:
         return _take_known_moments(channel)
-    are_few = corners is not None and corners <= CORNERS
-    can_list_corners = are_few and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
+    entries = (channel.inputs + 1) ** 2
+    can_list_corners = corners is not None and corners <= CORNERS and corners * entries <= MEMORY_LIMIT_ENTRIES
     return _bound_uncertain_moments(channel, can_list_corners)
 
 
