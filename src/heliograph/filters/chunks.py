@@ -235,10 +235,10 @@ class WarmUpRun(NamedTuple):
 
 
 def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
-    """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
+    """Return the state with which each chunk begins (chunks, ...); None if the filter forgets its start too late.
 
-    What it holds beside Gaussians, moments before any data, may never forget: then it is computed of all rows.
-    `first`: first rows of all chunks but the first one.
+    Each is computed from any start some rows before, forgotten by then. Moments before any data may never be forgotten:
+    they are then computed of all rows. `first`: first rows of all chunks but the first.
     """
     starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(warm_up, starts, first)

@@ -61,9 +61,9 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_largest_slopes(states: PyTree) -> Iterator[float]:
-    """Yield for each derivative in the states (n, ...) its largest entry, in standard deviations of its Gaussian.
+    """Yield for each derivative of a Gaussian in the states (n, ...) its largest entry, in deviations of the Gaussian.
 
-    A state's moving parts are Gaussians, each followed by the derivatives of its mean and covariance.
+    What data change in a state are Gaussians, each followed by the derivatives of its mean and covariance.
     """
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):

@@ -107,12 +107,12 @@ class Weighed(NamedTuple):
     weight: Array
 
     def summarise(self) -> "tuple[InnovationSummary, ...]":
-        """Return a summary over time for each output, one after the other.
+        """Return a summary over time for each output, one after the other: shares and medians with 95 % intervals.
 
-        Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours:
-        of the share Wilson's, with a of being down-weighted or not, since outliers come in runs behind a moving mean;
-        of the median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not
-        hide.
+        N values correlated over time count as N (1 - a) / (1 + a) independent ones, a the correlation of neighbours.
+        For the share of down-weighted values (Wilson's interval) a is that of being down-weighted, since outliers
+        come in runs; for the median (quantiles 1/2 -+ 1.96 / (2 sqrt N)) that of the innovations' ranks, which
+        outliers do not hide.
         """
         fields_by_output = [np.asarray(field).T for field in self]
         return tuple(_summarise_output(*of_output) for of_output in zip(*fields_by_output, strict=True))

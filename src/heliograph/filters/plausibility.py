@@ -122,7 +122,7 @@ class Judgement(NamedTuple):
     def find_culprit(
         candidates: "Sequence[Candidate]", size: "Callable[[Candidate], float]", excuses: "Callable[[Candidate], bool]"
     ) -> "Candidate":
-        """Return the first, from the largest on, without which a row is plausible; the largest if there is none.
+        """Return the first value, from the largest on, without which a row is plausible; the largest if there is none.
 
         Args:
             candidates: values of several nodes that one filter judged together, and found implausible.
@@ -167,8 +167,8 @@ class Judgement(NamedTuple):
         is_implausible = reason > 0
         if not is_implausible.any() or (~is_implausible & ~np.isnan(squared_distance)).any():
             return None
-        first_such = int(np.argmax(is_implausible))
-        return Judgement.describe(reason[first_such], squared_distance[first_such])
+        first_filter = int(np.argmax(is_implausible))
+        return Judgement.describe(reason[first_filter], squared_distance[first_filter])
 
     @staticmethod
     def why_inputs(judgements: Float[np.ndarray, "filters 4"]) -> str | None:
@@ -344,12 +344,12 @@ def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Return whether some number of a state became infinite."""
-    overflows = jnp.asarray(False)
-    for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        if _is_real_array(new):
-            overflows |= jnp.any(jnp.isinf(jnp.asarray(new)) & ~jnp.isinf(jnp.asarray(old)))
-    return overflows
+    """Return whether some real number of a state became infinite: it is after the step, and was not before."""
+    has_overflowed = jnp.asarray(False)
+    for number_before, number_after in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        if _is_real_array(number_after):
+            has_overflowed |= jnp.any(jnp.isinf(jnp.asarray(number_after)) & ~jnp.isinf(jnp.asarray(number_before)))
+    return has_overflowed
 
 
 def _is_real_array(leaf: Array) -> bool:

@@ -28,9 +28,9 @@ def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: in
     total = len(jax.tree.leaves(rows)[0])
     begin_if_adjacent = np.arange(len(begin)) * length
     view_count = int(np.sum((begin == begin_if_adjacent) & (begin_if_adjacent + length <= total)))
-    for which in (slice(view_count), slice(view_count, None)):
-        if len(first := begin[which]):
-            yield WindowBatch(which, first, take_windows(rows, first, length))
+    for selection in (slice(view_count), slice(view_count, None)):
+        if len(first := begin[selection]):
+            yield WindowBatch(selection, first, take_windows(rows, first, length))
 
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:

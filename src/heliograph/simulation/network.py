@@ -295,8 +295,8 @@ class Network(Module):
         """
         nodes_with_filter = [node for node in self.names if name in self.nodes[node].filters]
         if not nodes_with_filter:
-            all_filters = sorted({f for node in self.nodes.values() for f in node.filters})
-            raise fail("fusion", f"a filter that some node has {all_filters}", repr(name))
+            known_filters = sorted({filter for node in self.nodes.values() for filter in node.filters})
+            raise fail("fusion", f"a filter that some node has {known_filters}", repr(name))
         return nodes_with_filter
 
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
@@ -354,15 +354,13 @@ class Network(Module):
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Return sensor, channel and the filter `name` of each node that has it and receives over a channel.
 
-        Its own, or those that are common to all nodes; a node behind relays has neither.
+        The sensor and channel are the node's own, or those common to all nodes; a node behind relays has neither.
         """
         nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
-        # What has the sensor and channel of each: itself, or what all share; None behind relays.
-        holders = {label: node if isinstance(node, Node) else self.common for label, node in nodes.items()}
+        # Which object has the sensor and channel of each node: the node, or what all share; None behind relays.
+        owners = {label: node if isinstance(node, Node) else self.common for label, node in nodes.items()}
         return {
-            label: (holder.sensor, holder.channel, nodes[label].filters[name])
-            for label, holder in holders.items()
-            if holder
+            label: (owner.sensor, owner.channel, nodes[label].filters[name]) for label, owner in owners.items() if owner
         }
 
     def check_horizon(self, horizon: int) -> None:

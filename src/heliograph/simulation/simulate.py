@@ -184,10 +184,8 @@ def _warn_of_numbers_lost_in_float32(network: Network) -> None:
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
     if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
-        warning = (
-            "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
-        )
-        warnings.warn(warning, stacklevel=3)
+        finding = "single precision: numbers of plant or sensors below 1.2e-38 count as 0"
+        warnings.warn(f"{finding}; choose larger units, or float64", stacklevel=3)
 
 
 class _SimulationJob(Module):
@@ -333,8 +331,9 @@ def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     Each run goes to the next batch, and runs beyond the last batch (BATCHES) go on from the first: one row of batches,
     with what is beyond its end added to its begin.
     """
-    runs, zeros = values.shape[-1], (0,) * (values.ndim - 1)  # zeros: at the first place of all leading axes
-    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
+    *leading_axes, runs = values.shape
+    zeros = (0,) * len(leading_axes)  # the first index along all leading axes
+    row = jnp.zeros((*leading_axes, BATCHES + runs - 1), values.dtype)
     row = jax.lax.dynamic_update_slice(row, values, (*zeros, start))
     batches, beyond = row[..., :BATCHES], row[..., BATCHES:]
     return jax.lax.dynamic_update_slice(batches, batches[..., : runs - 1] + beyond, (*zeros, 0))

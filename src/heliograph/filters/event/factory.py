@@ -129,7 +129,7 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
         return "nominal"
     if isinstance(trigger, Periodic):
         return lower_claim_by_noise("exact", plant, sensor, channel)
-    # Silence keeps a Gaussian one, where it is no hidden loss; that a value was sent must say nothing more than it.
+    # Given silence x stays Gaussian, unless a loss may hide there; given a value, if its being sent says nothing more.
     losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
     determined = all(_arrival_determines_y(step) for step in steps)
     is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
@@ -147,10 +147,10 @@ def _has_known_gain(channel: ChannelByPattern) -> bool:
 
 
 def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
-    """Return the spread of gain and noise by mode and pattern, zero where it is rounding of a known gain.
+    """Return the covariance of (G, n), z = G y + n, by mode and pattern of arrivals, zero where it is only rounding.
 
-    Of z = G y + n, M = E G, the spread is Cov (G, n); E[G G'] - M M' of a known gain is at most some eps of |M M'|,
-    which `squared_gain` is, with a last row and column of zeros for n.
+    With M = E G, the spread E[G G'] - M M' of a known gain comes out as some eps of |M M'|. `squared_gain`: |M M'|,
+    with a last row and column of zeros for n.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
     squared_gain = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])

@@ -153,8 +153,7 @@ def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSu
     components, each in units of its variances.
     """
     while len(parts.log_weight) > count:
-        first, stop = places.start, places.stop
-        parts = _merge_cheapest_pair(parts, (first, stop))
+        parts = _merge_cheapest_pair(parts, (places.start, places.stop))
     return parts
 
 

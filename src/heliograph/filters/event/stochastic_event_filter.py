@@ -85,9 +85,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
         transition = jnp.asarray(at(self.channel, k).transition)
-        law = jnp.where(
-            state.moved, state.law @ transition, state.law
-        )  # at the first step the modes have their initial law
+        # At the first step the modes have their initial law.
+        law = jnp.where(state.moved, state.law @ transition, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)

@@ -50,11 +50,8 @@ class DiffuseFilter(AbstractSizedFilter):
         """Return the Gaussian before any data, with infinite variance in the state's unknown directions."""
         start = first(self.plant)
         covariance = start.initial_covariance
-        known, unknown = (
-            columns_of(covariance.known),
-            np.array(covariance.unknown),
-        )  # of the finite and infinite variances
-        return start_diffuse(jnp.asarray(start.initial_mean), known, unknown)
+        finite, infinite_directions = columns_of(covariance.known), np.array(covariance.unknown)
+        return start_diffuse(jnp.asarray(start.initial_mean), finite, infinite_directions)
 
     @predicts
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:

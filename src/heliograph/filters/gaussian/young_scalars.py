@@ -52,8 +52,8 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         """Return whether a free scalar still moves, and sweeps are left.
 
-        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched; SWEEPS:
-        most sweeps; CONVERGED, LOOP: what change is none, absolute and in units of rounding.
+        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched;
+        SWEEPS: the most sweeps. A change up to CONVERGED, or up to the rounding of t in a loop, counts as none.
         """
         t, previous, sweeps = carry
         smallest_move = rounding(CONVERGED, t, LOOP)

@@ -237,37 +237,35 @@ class SystemNoises(NamedTuple):
 def _factor_noises(system: LinearSystem) -> SystemNoises:
     """Return the factors of both noises at each step, with the rounding of numbers as large as the system makes them.
 
-    The noise's own rounding is joined too: else a combination of measurements that repeats another would measure,
-    without noise, the state times what rounding left of their difference. `lost`: rounding errors of noise variances
-    that came out of a subtraction.
+    Without the noise's own rounding, a combination of measurements that repeats another would seem to measure the
+    state without noise, by what rounding left of their difference.
     """
     steps = system.steps
     state_moments, received_moments = _second_moments_of_steps(system)
 
-    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> WeightedColumns:
+    def factor(covariances: np.ndarray, second_moments: np.ndarray, errors: np.ndarray) -> WeightedColumns:
         """Return the factors of noises (time, n, n), with the rounding of numbers of second moments (time, n)."""
-        rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
-        return _factor_with_rounding(factor_covariances(covariances), rounding, lost)
+        rounding = second_moments + np.diagonal(covariances, axis1=1, axis2=2)
+        return _factor_with_rounding(factor_covariances(covariances), rounding, errors)
 
     process = factor(np.asarray(steps.process), state_moments, np.zeros(state_moments.shape))
     return SystemNoises(process, factor(np.asarray(steps.noise), received_moments, system.received_rounding))
 
 
 @compile_in_float64
-def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -> WeightedColumns:
-    """Return the factors of each step's noise, joined with the rounding of numbers whose second moments are `seconds`.
+def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, rounding_errors: Array) -> WeightedColumns:
+    """Return the factors of each step's noise, joined with the rounding of numbers of these second moments.
 
-    `lost`: rounding errors that the noise's own variances have. Shapes: noise (steps, n, columns), seconds and lost
-    (steps, n).
+    `rounding_errors`: of the noise's own variances. Shapes: noise (steps, n, columns), the others (steps, n).
     """
 
-    def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:
-        """Return the factors of one step's noise plus two diagonal covariances: the rounding of numbers, and `lost`."""
-        lost_columns = WeightedColumns(np.eye(len(lost)), lost)
-        return triangularise(join_columns(noise, rounding_of(seconds), lost_columns))
+    def factor_step(noise: WeightedColumns, second_moments: jax.Array, rounding_errors: jax.Array) -> WeightedColumns:
+        """Return the factors of a step's noise plus two diagonal covariances: rounding of numbers and of variances."""
+        columns_of_errors = WeightedColumns(np.eye(len(rounding_errors)), rounding_errors)
+        return triangularise(join_columns(noise, rounding_of(second_moments), columns_of_errors))
 
     factor_steps: Callable[..., WeightedColumns] = jax.vmap(factor_step)
-    return factor_steps(noise, seconds, lost)
+    return factor_steps(noise, second_moments, rounding_errors)
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:

@@ -280,7 +280,7 @@ def _block_diagonal_columns(first_factor: np.ndarray, covariances: Sequence[jax.
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
-    """Return the best linear filter behind the sum of these terms, each with all outputs, which share no memory."""
+    """Return the best linear filter behind a sum of links, its terms, which share no memory; each has all outputs."""
     laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)

@@ -170,9 +170,9 @@ class ModalSmootherStep(SmootherStep):
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
-            """Condition one pair (mode, next mode) on what the future says of it; return it and the log-likelihood.
+            """Condition one pair (mode, next mode) on what later data say of it; return it and the log-likelihood.
 
-            The future says value = rows x + noise, as if measured.
+            Later data say value = rows x + noise, as if this were measured.
             """
             noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
             expected, slopes = observed.rows @ x.mean, observed.rows @ x.root
@@ -214,8 +214,8 @@ class ModalSmootherStep(SmootherStep):
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
 
     def start(self) -> EarlierState:
-        """Return the state after this step as an earlier state that is yet to be carried ahead."""
-        # None: several plants, where no one function moves the whole mixture.
+        """Return the state after this step as an earlier state, whose law is then carried from step to step."""
+        # `before` is None for several plants, where no one function moves the whole mixture.
         if self.before is None:
             raise fail("smoothing of plants with modes", "FixedInterval or FixedLag", "a fixed point")
         return super().start()

@@ -216,7 +216,8 @@ class MultipleModelFilter(AbstractSizedFilter):
         """
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
         _, updating_mode = self.merging.list_update_pairs(modes)
-        (signal, weights), plant = self.prior_signals(state, k), list_mode_models(at(self.plant, k))[0]
+        signal, weights = self.prior_signals(state, k)
+        plant = list_mode_models(at(self.plant, k))[0]  # all models have the same angles
         after, weight, innovation = correct_in_every_mode(
             signal, channel, jnp.asarray(updating_mode), weights, z, self.observed_angles
         )

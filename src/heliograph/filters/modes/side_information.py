@@ -105,11 +105,11 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> SideInformationBelief:
-        """Return the prior, independent of the mode."""
+        """Return the prior, in which state and mode are independent; x~ = (x - c, 1), p the law of the modes."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         unit = np.eye(len(self.states) + 1)[:, -1:]
-        # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
+        # Columns of q = (e, x~) in each mode: e, the error of (x~ 1{mode 1}, ...), is 1_j (x) x~ - p (x) (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
         errors = [kron(indicator[:, None], x) - kron(law[:, None], constant) for indicator in jnp.eye(len(law))]

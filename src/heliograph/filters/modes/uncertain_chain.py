@@ -201,13 +201,11 @@ def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax
 
 
 def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return a bound on diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
+    """Return a bound on diag(p) over all laws p of the modes, tight in the direction of equal entries.
 
-    delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u': diag(delta) = P diag(delta) P + u
-    d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e. P diag(delta) P is 0 for two modes.
-
-    `low`, `high` (M,): ends of each mode's probability p; `middle`: a law between them, from which p differs by at
-    most `reach`.
+    p = middle + delta, |delta_i| <= reach_i, delta summing to 0. With u = (1, ..., 1) / root M, P = I - u u' and d =
+    delta / root M: diag(delta) = P diag(delta) P + u d' + d u', and u d' + d u' <= e u u' + d d' / e by Young's
+    inequality. P diag(delta) P is 0 for two modes. `low`, `high` (M,): ends of each mode's probability.
     """
     modes, (middle, reach) = len(low), _find_middle_law(low, high)
     projection, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)

@@ -35,16 +35,16 @@ class _EntryDegrees(NamedTuple):
 
 @in_float64
 def is_affine(function: Callable[..., jax.Array], x: np.ndarray, indices: Sequence[int], *others: np.ndarray) -> bool:
-    """Return whether f(x, *rest) is seen to be affine in the entries of x at these places, whatever all others are.
+    """Return whether f(x, *others) is seen to be affine in the entries of x at these indices, whatever all others are.
 
-    Each entry has a degree: KNOWN, GIVEN (no dependence on those places), AFFINE in them, or OTHER; they are passed on
-    operation by operation.
+    Each entry has a degree: KNOWN, GIVEN (no dependence on those entries), AFFINE in them, or OTHER; they are passed
+    on operation by operation.
 
     Args:
         function: f, in operations of jax.numpy.
         x: a point (n,), by its shape.
-        places: of x, in which f is to be affine.
-        rest: further arguments, by their shapes.
+        indices: of the entries of x in which f is to be affine.
+        others: further arguments, by their shapes.
     """
     program = jax.make_jaxpr(function)(x, *others)
     degree = np.full(x.shape, GIVEN)

@@ -136,10 +136,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         unchanged.
         """
         weight = jax.nn.softmax(log_weight)
-        too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles
+        resamples = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
-        chosen = jax.lax.cond(too_few, resample_systematically, lambda *_: all_particles, weight, start)
-        return ResampledParticles(chosen, jnp.where(too_few, 0.0, log_weight))
+        chosen = jax.lax.cond(resamples, resample_systematically, lambda *_: all_particles, weight, start)
+        return ResampledParticles(chosen, jnp.where(resamples, 0.0, log_weight))
 
 
 def update_if_used(used: jax.Array, updated: State, before: State) -> State:

@@ -313,7 +313,7 @@ class _ParticleLoop:
     """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
 
     def __init__(self, filter: Any, programs: _ParticlePrograms):
-        """Keep the compiled programs, the memory in which they read and write, and how many particles count."""
+        """Keep the filter, its compiled programs, the memory that they read and write, and the number of particles."""
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
         self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
@@ -375,12 +375,12 @@ class _ParticleLoop:
             np.take(held, chosen, axis=0, out=new[:count], mode="clip")
         memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
 
-    def _advance(self, used: bool) -> float:
-        """Move particles, and weigh them by z if the row is used; return the largest log weight."""
-        self.memory.used[...] = used
+    def _advance(self, is_used: bool) -> float:
+        """Move all particles, and weigh them by z if the row is used; return the largest log weight."""
+        self.memory.used[...] = is_used
         self.programs.advance()
         for held in (*self.held, *self.predicted):
-            held[self.count :] = held[0]  # fills the lanes up
+            held[self.count :] = held[0]  # copies of one particle fill the last lanes
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:

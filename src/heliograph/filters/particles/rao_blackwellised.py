@@ -115,10 +115,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
         """Return the law of x_0 for the particles of these numbers (B,), drawn states first, in every mode."""
-        start, count, order = list_mode_models(at(self.plant, 0))[0], len(numbers), np.array(self.order)
-        x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
-        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
-        if not self._is_linear(list_mode_models(at(self.plant, 0))):
+        plants, count, order = list_mode_models(at(self.plant, 0)), len(numbers), np.array(self.order)
+        prior = from_covariance(plants[0].initial_mean[order], plants[0].initial_covariance[order][:, order])
+        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), prior)
+        if not self._is_linear(plants):
             x = self._draw_states(x, key, numbers)
         log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (count, 1))
         return Cloud(repeat_for_modes(x, len(self.initial)), log_mode)

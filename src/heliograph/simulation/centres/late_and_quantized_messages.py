@@ -62,11 +62,10 @@ def find_event_senders(
     squared_distance = jnp.einsum("ida,idab,idb->id", difference, information, difference)
     is_far = squared_distance > alpha * difference.shape[-1]
     # A node sends if it is far from what any neighbour received last; place 0 is the node itself.
-    is_far_for_neighbour = (is_far & present)[:, 1:]
-    receivers_that_need_it = (
-        jnp.zeros(len(difference), dtype=int).at[senders[:, 1:]].add(is_far_for_neighbour.astype(int))
-    )
-    return receivers_that_need_it > 0
+    is_far_for_neighbour = (is_far & present)[:, 1:].astype(int)
+    zeros = jnp.zeros(len(difference), dtype=int)
+    receivers_in_need = zeros.at[senders[:, 1:]].add(is_far_for_neighbour)
+    return receivers_in_need > 0
 
 
 def quantize_estimate(

@@ -388,9 +388,9 @@ def _describe_scale(declared_class: DeclaredClass, are_several: bool) -> list[st
     times, low, high, kind = declared_class.scale, declared_class.scale_low, declared_class.scale_high, "small"
     if times < 1:
         times, low, high, kind = 1 / times, 1 / high, 1 / low, "large"
-    which = f" from {declared_class.low:.3g} to {declared_class.high:.3g}" if are_several else ""
+    range_of_class = f" from {declared_class.low:.3g} to {declared_class.high:.3g}" if are_several else ""
     factor = f"{_two_digits(times)} times too {kind} ({_two_digits(low)} to {_two_digits(high)})"
-    return [f"declared variances{which} are {factor}; scaled so, the innovations pass"]
+    return [f"declared variances{range_of_class} are {factor}; scaled so, the innovations pass"]
 
 
 def _two_digits(value: float) -> str:

@@ -91,7 +91,7 @@ class WideAngles:
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
         self.received = {} if angles is None else {i: names[i] for i in angles.received}
-        self._most = find_largest_usable_deviation(filter) if self.states else np.inf
+        self._largest_usable = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
         """Return a row and a line for each received angle that is beyond a full turn (TURN) for the first time.
@@ -106,14 +106,13 @@ class WideAngles:
         return doubts
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each angle whose deviation is above `_most` radians for the first time.
+        """Return a row and a line for each angle that is known too badly (variance over the usable) for the first time.
 
-        Beyond that the filter cannot take it for a Gaussian. `states`: names of the angles of which nothing was said
-        yet, by state; one that is said is taken out.
+        `states`: names of the angles of which nothing was said yet, by state; one that is said is taken out.
         """
         doubts = []
         for i in list(self.states):
-            rows_of_wide = np.flatnonzero(variances[:, i] > self._most**2)
+            rows_of_wide = np.flatnonzero(variances[:, i] > self._largest_usable**2)
             if rows_of_wide.size:
                 known = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
                 doubts.append((int(rows_of_wide[0]), f"{known}; {REMEDY}"))

@@ -97,7 +97,7 @@ def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
             is_serious = not float(overload.bound) <= SEEN  # NaN too
-            yield Doubt(is_serious, overload.describe(name, label))
+            yield Doubt(serious=is_serious, words=overload.describe(name, label))
 
 
 def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
@@ -136,7 +136,7 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     if len(network.nodes) == 1 or not alone:
         return
     if len(alone) > NODES_LIMIT:
-        yield Doubt(False, f"boundedness of each node alone: not judged of {len(alone)} nodes")
+        yield Doubt(serious=False, words=f"boundedness of each node alone: not judged of {len(alone)} nodes")
         return
     for name in alone:
         node = network.nodes[name]
@@ -154,12 +154,12 @@ def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[D
         boundedness = certify_boundedness(network)
     except InputError as error:
         if serious:
-            yield Doubt(False, f"boundedness: not judged ({error})")
+            yield Doubt(serious=False, words=f"boundedness: not judged ({error})")
         return
     if boundedness.verdict == "impossible":
-        yield Doubt(serious, f"unbounded: {what} grows without end: {boundedness.reason}")
+        yield Doubt(serious=serious, words=f"unbounded: {what} grows without end: {boundedness.reason}")
     elif boundedness.verdict == "undecided":
-        yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
+        yield Doubt(serious=False, words=f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
 def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
@@ -177,7 +177,7 @@ def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
         heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
         if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
             advice = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
-            yield Doubt(True, f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
+            yield Doubt(serious=True, words=f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
             continue
         silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
         if silent:
@@ -210,7 +210,7 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
         for affine in list_told_maps(first(node.channel)):
             if why := affine.reason_for_no_claim:
                 what = join_names([repr(number) for number in affine.names])
-                yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
+                yield Doubt(serious=True, words=f"told: {what} at {name!r} {why}, so that claims are nominal")
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
@@ -225,20 +225,18 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
             continue  # said already, with what to do
         beliefs_by_words.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
     for (lowered, _, _), beliefs in beliefs_by_words.items():
-        other_nodes = (
-            f" (and at {join_names([repr(belief.node) for belief in beliefs[1:]])})" if len(beliefs) > 1 else ""
-        )
+        other_nodes = join_names([repr(belief.node) for belief in beliefs[1:]])
+        places = f" (and at {other_nodes})" if len(beliefs) > 1 else ""
         consequence = ", so that its claim is nominal" if lowered else ""
-        yield Doubt(lowered, f"another world: {beliefs[0].words}{other_nodes}{consequence}")
+        yield Doubt(serious=lowered, words=f"another world: {beliefs[0].words}{places}{consequence}")
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
     """Yield a doubt for filters that take a link's draws as independent over time, though its gains have memory."""
     for label, names in _list_forgetful_nodes(network).items():
-        words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
-        yield Doubt(
-            True, f"{words}, another channel than its own; linear_filter or mixture_filter of the link knows it"
-        )
+        finding = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
+        remedy = "another channel than its own; linear_filter or mixture_filter of the link knows it"
+        yield Doubt(serious=True, words=f"{finding}, {remedy}")
 
 
 def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:

@@ -168,7 +168,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
         `claims`: of the smoothed estimates' covariances, by node and filter.
         """
         statistics = {
-            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
+            node: {
+                name: replace(statistics_of_filter, claim=claims[node][name])
+                for name, statistics_of_filter in filters.items()
+            }
             for node, filters in smoothed.items()
         }
         filtered.smoothed = StatisticsByName(statistics, smoothed.states)

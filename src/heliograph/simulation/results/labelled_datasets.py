@@ -309,9 +309,9 @@ def make_name_array(names: Sequence[str]) -> np.ndarray:
 
 def check_title(dataset: "xr.Dataset", title: str) -> None:
     """Raise ValueError unless the dataset has this title."""
-    came = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
-    if came != title:
-        raise fail("dataset", f"one whose title is {title!r}", repr(came))
+    title_found = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
+    if title_found != title:
+        raise fail("dataset", f"one whose title is {title!r}", repr(title_found))
 
 
 def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
@@ -328,8 +328,8 @@ def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.nda
     """
     axes = list_axes(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
-        came = list(dataset[name].dims) if name in dataset else "no such variable"
-        raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", came)
+        found = list(dataset[name].dims) if name in dataset else "no such variable"
+        raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", found)
     return np.asarray(dataset[name].transpose(*axes).values)
 
 

@@ -89,12 +89,12 @@ def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str
         for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)
     ]
     entries += [("border-top:2px dashed;height:0", "truth")] if record.truth is not None else []
-    marks = [
+    spans = [
         f'<span style="margin-right:12px"><span style="display:inline-block;width:14px;height:8px;{style};'
         f'margin-right:4px"></span>{escape(visible(words))}</span>'
         for style, words in entries
     ]
-    return f"<div>{''.join(marks)}</div>"
+    return f"<div>{''.join(spans)}</div>"
 
 
 def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
@@ -150,9 +150,9 @@ def _read_curve(estimate: Estimate, state: int, rows: np.ndarray) -> tuple[np.nd
     return mean, mean - half_width, mean + half_width
 
 
-def _find_range(parts: Sequence[np.ndarray]) -> tuple[float, float]:
+def _find_range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     """Return the range of all finite values, a little wider, and never empty."""
-    values = np.concatenate(parts)
+    values = np.concatenate(arrays)
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 1.0

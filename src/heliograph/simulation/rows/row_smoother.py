@@ -319,9 +319,9 @@ def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:
-    """Return whether a filter can be smoothed: whether it has smoother steps, what a backward pass needs of a step.
+    """Return whether a filter can be smoothed: whether its steps return what a backward pass over the data needs.
 
-    Only the shapes of one are computed; a filter without them raises InputError.
+    Only the shapes of a step's result are computed; a filter that cannot be smoothed raises InputError.
     """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:

@@ -144,18 +144,25 @@ class StackedFilters(Module):
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
     def compute_by_node(
-        self, function: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+        self,
+        function: Callable[..., object],
+        states: PyTree,
+        filter_number: int,
+        z: jax.Array,
+        u: jax.Array,
+        k: jax.Array,
     ) -> PyTree:
         """Return function(filter, state, z, u, k) of filter number f at each node, with a leading axis of nodes.
 
         `states`: of all filters before step k. `z`: measurements (node, received).
         """
-        filters, states = self.take_filter(f, states)
+        filters, states = self.take_filter(filter_number, states)
         return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
 
-    def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
+    def take_filter(self, filter_number: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
         """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
-        rows = slice(f * self.nodes, (f + 1) * self.nodes)  # all nodes of the first filter stand first, and so on
+        begin = filter_number * self.nodes  # all nodes of the first filter stand first, and so on
+        rows = slice(begin, begin + self.nodes)
 
         def take_rows(leaf: PyTree) -> PyTree:
             """Return the rows of an array, anything else as it is."""
