@@ -71,7 +71,7 @@ class Gaussian(NamedTuple):
     def covariance(self) -> Any:
         """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are; the upper triangle mirrored: symmetric."""
         xp = library(self)
-        root, variances = (xp.asarray(part) for part in (self.root, self.variances))
+        root, variances = (xp.asarray(factor) for factor in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
         upper = np.triu(np.ones(product.shape[-2:], bool))
         return xp.where(upper, product, xp.swapaxes(product, -1, -2))
@@ -86,8 +86,8 @@ def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
 def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
     """Return the Gaussian of the summed covariances, by elimination: faster than orthogonal rows, less exact."""
     covariance = parts[0].covariance
-    for part in parts[1:]:
-        covariance = covariance + part.covariance
+    for columns in parts[1:]:
+        covariance = covariance + columns.covariance
     return from_covariance_by_elimination(mean, covariance)
 
 

@@ -366,8 +366,8 @@ def scan_means_where_settled(
     results = None if settled is None else scan_means(settled)
     if results is None:
         return scan_in_full(begun.states, slice(None))
-    if len(others := np.flatnonzero(~begun.covered)):
-        replace_chunk(results, others, scan_in_full(take(begun.states, others), others))
+    if len(unsettled_chunks := np.flatnonzero(~begun.covered)):
+        replace_chunk(results, unsettled_chunks, scan_in_full(take(begun.states, unsettled_chunks), unsettled_chunks))
     return results
 
 

@@ -108,8 +108,8 @@ def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: A
         after, _ = recursion.step(state, *row)
         return after, None
 
-    last, _ = jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))
-    return last
+    last_state, _ = jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))
+    return last_state
 
 
 def make_row_numbers(rows: PyTree, first: Array) -> Array:

@@ -235,11 +235,11 @@ def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vecto
 
     `late`: noise of the last hop, None if there is none; a sum of two is no Student noise.
     """
-    parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
+    independent_noises = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
-        component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None
-        else np.full(component.dimension, np.nan)
-        for component in parts
+        noise.degrees * np.ones(noise.dimension) if isinstance(noise, StudentT) and late is None
+        else np.full(noise.dimension, np.nan)
+        for noise in independent_noises
     ]  # fmt: skip
     degrees: Vector = library(values).concatenate(values)
     return degrees

@@ -266,8 +266,8 @@ def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) ->
         warnings.warn(f"{finding}: no particle explains what arrived, and the state stays as it was", stacklevel=4)
     if len(rows_of_few):
         smallest = float(np.min(np.asarray(counts)))
-        where = f"{len(rows_of_few)} of the rows, first row {rows_of_few[0]}"
-        finding = f"particle_filter: fewer than {FEW} particles count after {where} ({smallest:.2g} at least)"
+        affected_rows = f"{len(rows_of_few)} of the rows, first row {rows_of_few[0]}"
+        finding = f"particle_filter: fewer than {FEW} particles count after {affected_rows} ({smallest:.2g} at least)"
         warnings.warn(f"{finding}; take more of them", stacklevel=4)
 
 

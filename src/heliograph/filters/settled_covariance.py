@@ -118,8 +118,8 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
     after_second = jax.tree.map(lambda leaf: leaf[:, 1], after_windows)
     # Means follow the data, and are left out; all else must be the same.
     zero_means = [np.zeros_like(mean) for mean in means_of(after_second)]
-    first, second = (with_means(state, zero_means) for state in (after_first, after_second))
-    if not find_equal_states(second, first, ROUNDING)[0]:
+    first_without_mean, second_without_mean = (with_means(state, zero_means) for state in (after_first, after_second))
+    if not find_equal_states(second_without_mean, first_without_mean, ROUNDING)[0]:
         return None
     # Of the axes (run, window) one run, and the second window.
     state = jax.tree.map(lambda leaf: leaf[0, ...], after_second)

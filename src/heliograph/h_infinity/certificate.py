@@ -296,11 +296,11 @@ def _drop_absent_functions(
     difference between x and its estimate, h and h~ (`y` long) the sensor's. `at`: the first row of each part of eta,
     by letter.
     """
-    kept = list(range(len(phi)))
+    kept_rows = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
-            kept = [i for i in kept if not at[name] <= i < at[name] + width]
-    return np.asarray(phi[np.ix_(kept, kept)])
+            kept_rows = [i for i in kept_rows if not at[name] <= i < at[name] + width]
+    return np.asarray(phi[np.ix_(kept_rows, kept_rows)])
 
 
 def _complete_multipliers(multipliers: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:

@@ -180,17 +180,17 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 def _select_case(x: list[Interval]) -> Interval:
     """Return the interval of cases[which], x = [which, *cases].
 
-    Where `which` is open, from the lowest of the possible cases to the highest.
+    Where `case_number` is open, from the lowest of the possible cases to the highest.
 
-    `which`: interval of a whole number; open where its ends differ.
+    `case_number`: interval of a whole number; open where its ends differ.
     """
-    which, cases = x[0], x[1:]
+    case_number, cases = x[0], x[1:]
     lows = np.broadcast_arrays(*[case.low for case in cases])
     highs = np.broadcast_arrays(*[case.high for case in cases])
-    first, last = which.low.astype(int), which.high.astype(int)
+    lowest_case, highest_case = case_number.low.astype(int), case_number.high.astype(int)
     low, high = np.full(lows[0].shape, np.inf), np.full(lows[0].shape, -np.inf)
     for i, (a, b) in enumerate(zip(lows, highs, strict=True)):
-        is_possible = (first <= i) & (i <= last)
+        is_possible = (lowest_case <= i) & (i <= highest_case)
         low = np.where(is_possible, np.minimum(low, a), low)
         high = np.where(is_possible, np.maximum(high, b), high)
     dtype = cases[0].low.dtype
@@ -229,8 +229,8 @@ def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
     ULPS: units in the last place by which a power may be off. Even powers depend on |x| alone.
     """
     if exponent < 0:
-        one = point_interval(np.ones_like(a.low))
-        return _bound_quotient(one, _raise_interval_to_power(a, -exponent))
+        unit_interval = point_interval(np.ones_like(a.low))
+        return _bound_quotient(unit_interval, _raise_interval_to_power(a, -exponent))
     base = _bound_absolute(a) if exponent % 2 == 0 else a
     return round_outward(base.low**exponent, base.high**exponent, ULPS)
 
@@ -262,10 +262,10 @@ def _bound_cosine(a: Interval) -> Interval:
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     # Ends in multiples of pi, widened by more than their rounding.
-    first = a.low / np.pi - 1e-9 * (1 + np.abs(a.low))
-    last = a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
-    holds_even_multiple = np.floor(last / 2) >= np.ceil(first / 2)
-    holds_odd_multiple = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
+    low_in_pi = a.low / np.pi - 1e-9 * (1 + np.abs(a.low))
+    high_in_pi = a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
+    holds_even_multiple = np.floor(high_in_pi / 2) >= np.ceil(low_in_pi / 2)
+    holds_odd_multiple = np.floor((high_in_pi - 1) / 2) >= np.ceil((low_in_pi - 1) / 2)
     is_infinite = ~(np.isfinite(a.low) & np.isfinite(a.high))
     low = np.where(holds_odd_multiple | is_infinite, -1.0, cosine.low)
     high = np.where(holds_even_multiple | is_infinite, 1.0, cosine.high)

@@ -91,15 +91,15 @@ class GrowthFinding(NamedTuple):
     @property
     def text(self) -> str:
         """Verdict and evidence in one line."""
-        where = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
+        region = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
-            return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
+            return f"{self.name}: constant {self.constant:g} is proved {region} (no slope above {self.bound:.6g})"
         if not self.refuted:
             finding = "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
             reason = self.reason or finding
-            verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
+            verdict = f"not refuted {region} (largest slope {self.slope:.6g})"
             return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {reason}"
-        return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
+        return f"{self.name}: constant {self.constant:g} is false {region}: {self._describe_evidence()}"
 
     def _describe_evidence(self) -> str:
         """Return in words what refutes the constant: f(0), the slope at a point, or the ratio |df| / |dx| of a pair."""

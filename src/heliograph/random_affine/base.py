@@ -87,20 +87,20 @@ class AbstractRandomAffine(Module):
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the state before the first draw; () where the map forgets: each draw is independent of the last."""
-        held = memories(self)  # of links inside, by identity
-        if not held:
+        memories_inside = memories(self)  # of links inside, by identity
+        if not memories_inside:
             return self._init(key)
         # A key for each memory, which is drawn once even where several maps inside share it, and one for the maps.
-        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        key_of_maps, *keys = jax.random.split(key, len(memories_inside) + 1)
         return init_with_shared_memories(self, key_of_maps, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the next state, of the same structure and shapes, and H = [[G, n], [0, 1]] (outputs + 1, inputs + 1)."""
-        held = memories(self)
-        if not held:
+        memories_inside = memories(self)
+        if not memories_inside:
             return self._draw(state, key)
         # A key for each memory, which moves once even where several maps inside share it, and one for the maps.
-        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        key_of_maps, *keys = jax.random.split(key, len(memories_inside) + 1)
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -124,8 +124,8 @@ class AbstractRandomAffine(Module):
             ValueError: the map remembers, so that there is no draw without its state.
         """
         if self.remembers:
-            what = f"sample of {type(self).__name__}"
-            raise fail(what, "a map that forgets", "one that remembers; use init and draw")
+            title = f"sample of {type(self).__name__}"
+            raise fail(title, "a map that forgets", "one that remembers; use init and draw")
         _, matrix = self.draw((), key)
         return matrix
 
@@ -162,8 +162,8 @@ class AbstractRandomAffine(Module):
         above, or where they are not counted (None), intervals of the parts are multiplied: sound but not attained.
         """
         check_forgets("channel of a bound", self)
-        corners = count_corners(self)
-        if corners is None or corners > CORNERS:
+        corner_count = count_corners(self)
+        if corner_count is None or corner_count > CORNERS:
             return self._interval_of_parts(order)
         matrices = self.corner_moments(order)
         return matrices.min(axis=0), matrices.max(axis=0)

@@ -316,8 +316,8 @@ def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarr
     identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
     rows = list[list[bool]]()
     for parallel_map in channel.in_parallel:
-        own = {affine.memory.identity for affine in list_told_maps(parallel_map)}
-        rows += [[identity in own for identity in identities]] * parallel_map.outputs
+        identities_of_map = {affine.memory.identity for affine in list_told_maps(parallel_map)}
+        rows += [[identity in identities_of_map for identity in identities]] * parallel_map.outputs
     return np.array(rows)
 
 

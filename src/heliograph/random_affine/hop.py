@@ -245,9 +245,9 @@ class GainAndNoise(AbstractHop):
 def affine_matrix(matrix: Matrix) -> Matrix:
     """Return [[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
-    right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
+    zero_column, last_row = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
-    extended: Matrix = xp.concatenate([xp.concatenate([matrix, right], axis=1), below])
+    extended: Matrix = xp.concatenate([xp.concatenate([matrix, zero_column], axis=1), last_row])
     return extended
 
 

@@ -59,12 +59,12 @@ def draw_with_shared_memories(
 ) -> tuple[ChannelState, jax.Array]:
     """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H.
 
-    The state: those of all memories in a channel, and the `rest`, that of the channel given these.
+    The state: those of all memories in a channel, and the `rest_of_channel`, that of the channel given these.
     """
-    rest, matrix = condition_on_memories(channel, state.memories).draw(state.rest, key)
+    rest_of_channel, matrix = condition_on_memories(channel, state.memories).draw(state.rest, key)
     triples = zip(memories(channel).values(), state.memories, keys, strict=True)
-    moved = tuple(memory.move(memory_state, memory_key) for memory, memory_state, memory_key in triples)
-    return ChannelState(moved, rest), matrix
+    next_memories = tuple(memory.move(memory_state, memory_key) for memory, memory_state, memory_key in triples)
+    return ChannelState(next_memories, rest_of_channel), matrix
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
@@ -118,13 +118,15 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
     Named memories stay shared. The first map keeps its memories; later ones get copies, labelled by their index.
     """
-    separated, used = [], set[str]()
+    separated, used_identities = [], set[str]()
     for index, affine in enumerate(maps):
-        own = memories(affine)
-        shared = {key: memory for key, memory in own.items() if memory.name is None and key in used}
+        memories_of_map = memories(affine)
+        shared = {
+            key: memory for key, memory in memories_of_map.items() if memory.name is None and key in used_identities
+        }
         labelled = {key: memory.labelled(f"{key} of {index}") for key, memory in shared.items()}
         separated.append(replace_memories(affine, labelled))
-        used |= set(own)
+        used_identities |= set(memories_of_map)
     return separated
 
 
@@ -133,14 +135,14 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
     So they go on from step to step. Maps as they are where the first has no memory, or steps have different counts.
     """
-    by_map = [memories(affine) for affine in maps]
-    if not by_map[0] or len({len(held) for held in by_map}) > 1:
+    memories_by_map = [memories(affine) for affine in maps]
+    if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:
         return list(maps)
     aligned = []
-    for affine, held in zip(maps, by_map, strict=True):
+    for affine, memories_of_map in zip(maps, memories_by_map, strict=True):
         labelled = {
             key: memory.labelled(label)
-            for (key, memory), label in zip(held.items(), by_map[0], strict=True)
+            for (key, memory), label in zip(memories_of_map.items(), memories_by_map[0], strict=True)
             if memory.name is None
         }
         aligned.append(replace_memories(affine, labelled))

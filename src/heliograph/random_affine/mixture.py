@@ -82,9 +82,9 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """
         corners_by_map = [affine.corner_moments(order) for affine in self.maps]
         weights = self.choice.corners()
-        corner_numbers = np.array(list(product(*(range(len(corners)) for corners in corners_by_map)))).T
+        corner_numbers = np.array(list(product(*(range(len(corners_of_map)) for corners_of_map in corners_by_map)))).T
         combined = stack_parts(
-            [corners[numbers] for corners, numbers in zip(corners_by_map, corner_numbers, strict=True)]
+            [corners_of_map[numbers] for corners_of_map, numbers in zip(corners_by_map, corner_numbers, strict=True)]
         )
         # By corner of the weights, combination, row and column; then by corner of the mixture, row and column.
         moments = library(weights, combined).tensordot(weights, combined, axes=1)
@@ -132,8 +132,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
         moments = self.moments(2)
         mean = moments.mean
-        places = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
-        second_moment = moments.matrix[places, -1]  # E[n n'], the coefficients of 1
+        noise_products = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
+        second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
         noise = Gaussian(second_moment - offset[:, None] * offset, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

@@ -249,18 +249,18 @@ class Independent(AbstractNoise):
         self.parts = tuple(items("independent noises", parts, "laws"))
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
-        if others := [part for part in self.parts if not isinstance(part, AbstractNoise)]:
-            raise fail("independent noises", "laws of a noise vector", show_value(others[0]))
-        means, covariances = [part.mean for part in self.parts], [part.covariance for part in self.parts]
+        if no_noises := [noise for noise in self.parts if not isinstance(noise, AbstractNoise)]:
+            raise fail("independent noises", "laws of a noise vector", show_value(no_noises[0]))
+        means, covariances = [noise.mean for noise in self.parts], [noise.covariance for noise in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = block_diagonal(covariances)
 
     @property
     def columns(self) -> WeightedColumns:
         """Columns A and weights w with covariance A diag(w) A': those of the parts, one after another."""
-        columns_by_part = [part.columns for part in self.parts]
-        matrices = [columns.matrix for columns in columns_by_part]
-        weights = library(columns_by_part).concatenate([columns.weights for columns in columns_by_part])
+        columns_by_noise = [noise.columns for noise in self.parts]
+        matrices = [columns.matrix for columns in columns_by_noise]
+        weights = library(columns_by_noise).concatenate([columns.weights for columns in columns_by_noise])
         return WeightedColumns(block_diagonal(matrices), weights)
 
     @property
@@ -279,22 +279,23 @@ class Independent(AbstractNoise):
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return mean and covariance of the independent parts without their outliers, one above the other."""
-        inliers = [part.without_outliers() for part in self.parts]
-        mean = library(inliers).concatenate([noise.mean for noise in inliers])
-        return NoiseWithoutOutliers(mean, block_diagonal([noise.covariance for noise in inliers]))
+        inliers = [noise.without_outliers() for noise in self.parts]
+        mean = library(inliers).concatenate([inlier.mean for inlier in inliers])
+        return NoiseWithoutOutliers(mean, block_diagonal([inlier.covariance for inlier in inliers]))
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return every atom of each part with every one of the others."""
         return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the noise of each group of components, of the parts that it takes; None where one is of two groups."""
-        # Which part each component belongs to, and the parts that have a component in each group.
-        part_of_component = np.repeat(np.arange(len(self.parts)), [part.dimension for part in self.parts])
-        parts = [[self.parts[i] for i in dict.fromkeys(part_of_component[list(group)].tolist())] for group in groups]
-        dimensions = [sum(part.dimension for part in parts_of_group) for parts_of_group in parts]
+        """Return the noise of each group of components, of the noises it takes; None where one is of two groups."""
+        # Which noise each component belongs to, and the noises that have a component in each group.
+        noise_of_component = np.repeat(np.arange(len(self.parts)), [noise.dimension for noise in self.parts])
+        numbers_by_group = [dict.fromkeys(noise_of_component[list(group)].tolist()) for group in groups]
+        noises_by_group = [[self.parts[i] for i in numbers] for numbers in numbers_by_group]
+        dimensions = [sum(noise.dimension for noise in noises) for noises in noises_by_group]
         are_whole = dimensions == [len(group) for group in groups]
-        return [Independent(parts_of_group) for parts_of_group in parts] if are_whole else None
+        return [Independent(noises) for noises in noises_by_group] if are_whole else None
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
@@ -302,18 +303,18 @@ class Independent(AbstractNoise):
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 
     def report(self, y: jax.Array) -> jax.Array:
-        """Return what each part reports (as rounded values) of its components of a measurement y."""
-        ends = np.cumsum([part.dimension for part in self.parts])[:-1]
-        y_by_part = jnp.split(y, ends)
-        return jnp.concatenate([part.report(y_part) for part, y_part in zip(self.parts, y_by_part, strict=True)])
+        """Return what each noise's own part of a measurement y is reported as, such as rounded values."""
+        ends = np.cumsum([noise.dimension for noise in self.parts])[:-1]
+        pairs = zip(self.parts, jnp.split(y, ends), strict=True)
+        return jnp.concatenate([noise.report(y_of_noise) for noise, y_of_noise in pairs])
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a], the product of E[n_part^a_part] over the independent parts; `powers`: a, by component."""
+        """Return E[n^a], the product of E[n_j^a_j] over the independent noises n_j; `powers`: a, by component."""
         product: Number = 1.0
         next_powers = iter(powers)
-        for part in self.parts:
-            exponents = tuple(islice(next_powers, part.dimension))
-            product *= part.moment(exponents) if any(exponents) else 1.0
+        for noise in self.parts:
+            exponents = tuple(islice(next_powers, noise.dimension))
+            product *= noise.moment(exponents) if any(exponents) else 1.0
         return product
 
 

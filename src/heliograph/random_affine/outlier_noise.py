@@ -313,9 +313,9 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     survival = 1 - np.arange(count + 1) / count  # at the slices' ends; at 0 the logarithm is multiplied by 0
     time = -np.log(np.where(survival > 0, survival, 1.0))
-    first = count * -np.diff(survival * (time + 1))
-    second = count * -np.diff(survival * (time**2 + 2 * time + 2))
-    return first, second - first**2
+    mean = count * -np.diff(survival * (time + 1))
+    mean_square = count * -np.diff(survival * (time**2 + 2 * time + 2))
+    return mean, mean_square - mean**2
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:

@@ -111,9 +111,11 @@ class Series(AbstractCombination):
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
         """Hold the maps in the order of their application; each takes as many inputs as the last has outputs."""
         self.maps = check_maps("series", maps)
-        for first, second in zip(self.maps, self.maps[1:], strict=False):
-            if first.outputs != second.inputs:
-                raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
+        for affine, next_affine in zip(self.maps, self.maps[1:], strict=False):
+            if affine.outputs != next_affine.inputs:
+                raise fail(
+                    "series", f"a map that takes {affine.outputs} inputs", f"one that takes {next_affine.inputs}"
+                )
 
     @property
     def outputs(self) -> int:
@@ -133,9 +135,9 @@ class Series(AbstractCombination):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H)] of the series, k = `order`: E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
-        first, *others = self.maps
-        matrix = first.moments(order).matrix
-        for affine in others:
+        first_map, *later_maps = self.maps
+        matrix = first_map.moments(order).matrix
+        for affine in later_maps:
             matrix = affine.moments(order).matrix @ matrix
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
@@ -145,9 +147,9 @@ class Series(AbstractCombination):
 
         A corner is an extreme law of those possible. Those of the first map vary slowest.
         """
-        joint_corners, *others = (affine.corner_moments(order) for affine in self.maps)
-        for corners in others:
-            products = corners @ joint_corners[:, None]  # (corner before, corner, row, column)
+        joint_corners, *corners_of_later_maps = (affine.corner_moments(order) for affine in self.maps)
+        for corners_of_map in corners_of_later_maps:
+            products = corners_of_map @ joint_corners[:, None]  # (corner before, corner, row, column)
             joint_corners = products.reshape(-1, *products.shape[2:])
         return joint_corners
 
@@ -195,9 +197,9 @@ class Series(AbstractCombination):
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Return the series without the noise of its last map where its law has outliers, and that noise; else None."""
-        *before, last = self.maps
-        last_without_noise, noise = last.detach_outliers()
-        return (self, None) if noise is None else (Series([*before, last_without_noise]), noise)
+        *earlier_maps, last_map = self.maps
+        last_without_noise, noise = last_map.detach_outliers()
+        return (self, None) if noise is None else (Series([*earlier_maps, last_without_noise]), noise)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the series with visit(name, hop, signal) in place of each hop, and the position behind it.

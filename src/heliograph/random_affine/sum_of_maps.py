@@ -193,8 +193,8 @@ class Superposed(AbstractCombination):
 
         The position behind it is that before it: the links side by side are not on the chain.
         """
-        parts = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
-        visited = [affine.visit_hops(visit, at.select_components(taken))[0] for (affine, at), taken in parts]
+        maps_with_places = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
+        visited = [affine.visit_hops(visit, at.select_components(place))[0] for (affine, at), place in maps_with_places]
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
@@ -348,16 +348,16 @@ def move_sensor_into_links(
     C: `matrix`, the sensor's; i: the components of y that link i takes. None where the parts of v that links carry are
     not independent, or where the channel does not begin with a sum.
     """
-    first, *rest = channel.in_series
-    if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:
+    first, *later_maps = channel.in_series
+    if not isinstance(first, Superposed) or (noises_of_links := noise.split(first.places)) is None:
         return None
     links = []
-    for taken, noise_of_link, link in zip(first.places, parts, first.maps, strict=True):
+    for taken, noise_of_link, link in zip(first.places, noises_of_links, first.maps, strict=True):
         sensor_of_link = GainAndNoise(Constant(1.0), np.asarray(matrix)[list(taken)], noise_of_link)
         links.append(Series([sensor_of_link, link]))
     n = np.shape(matrix)[1]
     all_of_x = tuple(range(n))
-    return Series([Superposed(links, first.noise, [all_of_x] * len(links), n), *rest])
+    return Series([Superposed(links, first.noise, [all_of_x] * len(links), n), *later_maps])
 
 
 class _MapsWithMemories(NamedTuple):

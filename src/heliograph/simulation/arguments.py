@@ -49,8 +49,8 @@ def read_measurements(name: str, value: ArrayLike, steps: int, node: Node | Rece
 
     (steps,) is accepted for one component. A table whose columns have the components' names must have their order too.
     """
-    what, received = f"measurements of node {name!r}", node.received
-    check_columns(what, value, node.received_names)
-    is_one_axis = received == 1 and rank(what, value) == 1
-    values: np.ndarray = array(what, value, (steps,) if is_one_axis else (steps, received), missing=True)
+    title, received = f"measurements of node {name!r}", node.received
+    check_columns(title, value, node.received_names)
+    is_one_axis = received == 1 and rank(title, value) == 1
+    values: np.ndarray = array(title, value, (steps,) if is_one_axis else (steps, received), missing=True)
     return values[:, None] if is_one_axis else values

@@ -102,8 +102,8 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     nodes = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
-            own = find_premise(network, name)
-            filters = {label: lower_claim_if_mistaken(own, filter) for label, filter in node.filters.items()}
+            own_models = find_premise(network, name)
+            filters = {label: lower_claim_if_mistaken(own_models, filter) for label, filter in node.filters.items()}
             nodes[name] = _replace_filters(node, filters)
     return nodes
 
@@ -128,10 +128,12 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
     """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
-    own = find_common_premise(network)
+    own_models = find_common_premise(network)
     return {
-        name: lower_claim_if_mistaken(own, f) if isinstance(f, AbstractFilter) else f
-        for name, f in network.fused.items()
+        name: lower_claim_if_mistaken(own_models, filter_or_fusion)
+        if isinstance(filter_or_fusion, AbstractFilter)
+        else filter_or_fusion
+        for name, filter_or_fusion in network.fused.items()
     }
 
 
@@ -224,13 +226,17 @@ def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, Abstr
     """
     for label, filter in filters.items():
         is_known = filter.premise is not None or filter.kept.lowered
-        if filter.claim != "none" and is_known and (parts := list_mistaken_parts(own, filter)):
-            yield MistakenBelief(node, label, parts, filter.kept.lowered)
+        if filter.claim != "none" and is_known and (mistaken_parts := list_mistaken_parts(own, filter)):
+            yield MistakenBelief(node, label, mistaken_parts, filter.kept.lowered)
 
 
 def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
     """Return the claim of each estimate of a network, by (node, name); those of the centre last, under FUSED."""
-    claims = {(name, f): filter.claim for name, node in network.nodes.items() for f, filter in node.filters.items()}
+    claims = {
+        (name, filter_name): filter.claim
+        for name, node in network.nodes.items()
+        for filter_name, filter in node.filters.items()
+    }
     for name, mesh in network.meshes.items():
         claim_of_mesh = find_claim_of_mesh(name, mesh, network)
         claims |= {(node, name): claim_of_mesh for node in network.mesh_nodes(name)}

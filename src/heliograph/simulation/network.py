@@ -276,15 +276,15 @@ class Network(Module):
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
         """
-        given = set(names)
+        measured_nodes = set(names)
         optional = set() if self.relays is None else set(self.relays.relays)
         # Names that are given and no node's, or the reverse; relays alone may lack.
-        mismatched = sorted((given ^ set(self.nodes)) - (optional - given))
+        mismatched = sorted((measured_nodes ^ set(self.nodes)) - (optional - measured_nodes))
         if mismatched:
             raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {mismatched}")
-        if len(given) == len(self.nodes):
+        if len(measured_nodes) == len(self.nodes):
             return self
-        nodes = {name: node for name, node in self.nodes.items() if name in given}
+        nodes = {name: node for name, node in self.nodes.items() if name in measured_nodes}
         return Network(self.plant, nodes, relays=self.relays)
 
     def nodes_with(self, name: str) -> list[str]:

@@ -286,9 +286,16 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
     """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
-        for what, ours, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
-            if len(ours) != len(theirs):
-                raise fail(name, f"the plant's {len(ours)} {what} {list(ours)}", f"{len(theirs)} {list(theirs)}")
+        for kind, of_plant_names, of_filter_names in (
+            ("states", plant.states, filter.states),
+            ("inputs", plant.inputs, filter.inputs),
+        ):
+            if len(of_plant_names) != len(of_filter_names):
+                raise fail(
+                    name,
+                    f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
+                    f"{len(of_filter_names)} {list(of_filter_names)}",
+                )
     # Attitudes are turned where others are added.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:

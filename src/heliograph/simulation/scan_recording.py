@@ -79,8 +79,10 @@ def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> O
         raise fail("after", EXPECTED, "a record without the last states of its filters")
     if smooths:
         raise fail("after", "no smoothing, which needs all rows at once", "smooth")
-    if late := [*filters.reporting, *filters.meshes]:
-        raise fail("after", "no fusion by reports or between neighbours, which may come rows later", late)
+    if fusions_with_delays := [*filters.reporting, *filters.meshes]:
+        raise fail(
+            "after", "no fusion by reports or between neighbours, which may come rows later", fusions_with_delays
+        )
     if not origin.has_form_of(jax.eval_shape(filters.init)):
         raise fail("after", EXPECTED, "one of another network")
     return origin
@@ -94,10 +96,12 @@ def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
     """
     if origin is None:  # nothing is before them
         return clock
-    last, first = np.asarray(origin.time), clock[0]
-    if last.dtype.kind != clock.dtype.kind or first < last:  # a date and a number, or times that go backwards
-        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
-    return np.append(last, clock)
+    last_time, first_time = np.asarray(origin.time), clock[0]
+    if (
+        last_time.dtype.kind != clock.dtype.kind or first_time < last_time
+    ):  # a date and a number, or times that go backwards
+        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first_time))
+    return np.append(last_time, clock)
 
 
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:

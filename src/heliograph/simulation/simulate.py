@@ -159,8 +159,8 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
         x = np.asarray(record.truth)[..., network.states.index(name)]
         is_beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
         if is_beyond.any():
-            where = f"in {is_beyond.any(axis=1).sum()} of {len(is_beyond)} runs"
-            finding = f"the true {name!r} leaves its limits {low:g} to {high:g} {where}"
+            affected_runs = f"in {is_beyond.any(axis=1).sum()} of {len(is_beyond)} runs"
+            finding = f"the true {name!r} leaves its limits {low:g} to {high:g} {affected_runs}"
             remedy = "filters believe them, the plant's transition and noise have to keep them"
             warnings.warn(f"{finding}, first at step {np.argmax(is_beyond.any(axis=0))}: {remedy}", stacklevel=4)
 

@@ -54,10 +54,10 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
-        begun = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
-        if begun is None:
+        chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
+        if chunk_starts is None:
             return None
-        return _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
+        return _smooth_all(SmootherStepRecursion(filter, chunk_starts.lengths.chunk), chunk_starts, rows)
 
 
 def smooth_chunk(

@@ -70,9 +70,9 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         """Draw the filter's state between two steps, given `later`, drawn after both; keep the plant's part of it."""
         previous, step, key = pair
         # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
-        left, manifold = step.before.left, step.manifold
+        state_before, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
-        x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))
+        x = manifold.settle(state_before.mean, _draw_gaussian(state_before._replace(mean=mean), key))
         return x, _take_plant_state(previous, x)
 
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))

@@ -79,9 +79,9 @@ class EventFilter(AbstractSizedFilter):
         ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
         if self.trigger.heartbeat is None or ages <= self.ages:
             return self
-        larger = copy(self)  # with what it knows of its world
-        object.__setattr__(larger, "ages", ages)  # fields are frozen
-        return larger
+        filter_with_room = copy(self)
+        object.__setattr__(filter_with_room, "ages", ages)  # fields are frozen
+        return filter_with_room
 
     @property
     def senders(self) -> list[slice]:
@@ -99,14 +99,14 @@ class EventFilter(AbstractSizedFilter):
         """Return the prior of (x, r), x the plant's state and r the reference of the sender: none was sent yet."""
         start, m = at(self.plant, 0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
-        certain = WeightedColumns(np.eye(m), jnp.zeros(m))
-        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), certain)  # r = 0 (m,)
+        known_reference = WeightedColumns(np.eye(m), jnp.zeros(m))
+        joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
-        begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.from_sum(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), label[None])
+        has_sent = jnp.full(len(self.senders), not self.trigger.needs_reference)
+        return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
         """Return a sum of one Gaussian, padded with copies of weight zero to the filter's number of Gaussians."""

@@ -81,7 +81,9 @@ def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Ar
     covariance = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
     covariance = covariance.at[:, 0, 0].set(tails.covariance[:, 0, 0])
     outer_pieces = BallMoments(tails.log_mass, mean, covariance)
-    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, outer_pieces, strict=True)))
+    return BallMoments(
+        *(jnp.concatenate(pieces_and_tails) for pieces_and_tails in zip(pieces, outer_pieces, strict=True))
+    )
 
 
 def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:

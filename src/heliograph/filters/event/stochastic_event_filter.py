@@ -83,14 +83,14 @@ class StochasticEventFilter(AbstractSizedFilter):
         The reference is what the sender compares its signal with.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
+        predicted = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
         transition = jnp.asarray(at(self.channel, k).transition)
         # At the first step the modes have their initial law.
         law = jnp.where(state.moved, state.law @ transition, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)
-        return StochasticBelief(gaussian=moved, law=law, reference=reference, moved=jnp.asarray(True))
+        return StochasticBelief(gaussian=predicted, law=law, reference=reference, moved=jnp.asarray(True))
 
     def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""

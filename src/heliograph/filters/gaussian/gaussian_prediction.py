@@ -105,9 +105,9 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
         return reduce(jnp.maximum, [second_moments_at_start(model, start) for model in first_step.models])
     start = first_step if start is None else start
     mean = jnp.asarray(start.initial_mean)
-    spread = start.initial_covariance
-    known = spread.known if isinstance(spread, UnknownStart) else spread
-    second_moments = mean * mean + diagonal(known)
+    initial_covariance = start.initial_covariance
+    known_covariance = initial_covariance.known if isinstance(initial_covariance, UnknownStart) else initial_covariance
+    second_moments = mean * mean + diagonal(known_covariance)
     if isinstance(first_step.noise, AbstractNoise):
         second_moments = second_moments + diagonal(first_step.noise.covariance)
     return jnp.asarray(second_moments)
@@ -179,13 +179,13 @@ class PredictsByTransform(Protocol):
 def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasInitialMoments) -> SmootherStep:
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
-    `start`: the plant or filter from whose initial law rounding is counted. `rest`: covariance of x+ given x, which
-    the slopes of f in x do not explain.
+    `start`: the plant or filter from whose initial law rounding is counted. `unexplained`: covariance of x+ given x,
+    which the slopes of f in x do not explain.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)
-    rest = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
-    return smoother_step_of(step, (image.slopes, rest), filter.claim, plant.manifold)
+    unexplained = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
+    return smoother_step_of(step, (image.slopes, unexplained), filter.claim, plant.manifold)
 
 
 def choose_initial_moments(

@@ -70,8 +70,8 @@ def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     Slopes: (D^-1 L^-1 Cov(x, f))'; the curvature is Cov f less slopes D slopes'.
     """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
-    rest = moments.covariance - (slopes * x.variances) @ slopes.T
-    return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
+    unexplained = moments.covariance - (slopes * x.variances) @ slopes.T
+    return image_by_slopes(moments.mean, slopes, x, eliminate(unexplained))
 
 
 class Cubature(AbstractTransform):
@@ -168,9 +168,9 @@ class PolynomialMoments(AbstractTransform):
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         # What f has beside its best linear fit, at each point.
-        rest = values - center[:, None] - slopes @ points.T
+        residuals = values - center[:, None] - slopes @ points.T
         explained = WeightedColumns(slopes, np.ones(len(deviations)))
-        return Image(center, explained, deviations, eliminate(WeightedColumns(rest, weights).covariance))
+        return Image(center, explained, deviations, eliminate(WeightedColumns(residuals, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:

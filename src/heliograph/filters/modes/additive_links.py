@@ -293,4 +293,4 @@ def independent_terms(channel: Channel) -> list[Channel]:
     # Steps that split differently have no terms in common.
     if len({len(terms) for terms in terms_by_step}) > 1 or len(terms_by_step[0]) == 1:
         return [channel]
-    return [vary_over_steps(parts, channel) for parts in zip(*terms_by_step, strict=True)]
+    return [vary_over_steps(term_at_each_step, channel) for term_at_each_step in zip(*terms_by_step, strict=True)]

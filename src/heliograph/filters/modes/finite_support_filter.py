@@ -132,9 +132,9 @@ class MixtureFilter(AbstractSizedFilter):
         """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
-        moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
+        predicted = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
-        return MixtureBelief(gaussian=moved, law=law, moved=jnp.asarray(True))
+        return MixtureBelief(gaussian=predicted, law=law, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:

@@ -137,10 +137,10 @@ class ModeObservedFilter(AbstractSizedFilter):
         The states of the links' memories are received one step late: then the last correction can be made with the
         channel's moments given them.
         """
-        last = jnp.maximum(jnp.asarray(k) - 1, 0)
-        channel = _find_moments_given_states(at(self.channel, last), memory_states)
+        last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
+        channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
         start = second_moments_at_start(self.plant)
-        corrected, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
+        corrected, _ = correct_linear(state.before, at(self.sensor, last_step), channel, Polytope(), state.z, start)
         return predict_belief(corrected, state.move)
 
     def _describe_channel_after(self, begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
@@ -148,8 +148,8 @@ class ModeObservedFilter(AbstractSizedFilter):
 
         `begun`: whether a step was before. A memory is what a link remembers, such as its mode.
         """
-        channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
-        at_later_step = _find_moments_given_earlier_states(at(self.channel, last), channel, memory_states)
+        channel, last_step = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
+        at_later_step = _find_moments_given_earlier_states(at(self.channel, last_step), channel, memory_states)
         at_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
         moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), at_later_step, at_first_step)
         return moments

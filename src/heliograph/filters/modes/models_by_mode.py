@@ -57,7 +57,7 @@ def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")
     if not isinstance(model, ModalPlant | ModalSensor):
         return (0,) * len(by_mode)
-    number_of_model = {id(each): i for i, each in reversed(list(enumerate(model.models)))}
+    number_of_model = {id(candidate): i for i, candidate in reversed(list(enumerate(model.models)))}
     return tuple(number_of_model[id(of_mode)] for of_mode in by_mode)
 
 

@@ -182,8 +182,8 @@ class MultipleModelFilter(AbstractSizedFilter):
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes; no step was predicted (`moved`)."""
         start, weight = at(self.plant, 0), self.merging.initial_weights(jnp.asarray(self.initial))
-        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
-        return ModalBeliefs(parts, weight, moved=jnp.asarray(False))
+        gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
+        return ModalBeliefs(gaussians, weight, moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
@@ -221,8 +221,8 @@ class MultipleModelFilter(AbstractSizedFilter):
         after, weight, innovation = correct_in_every_mode(
             signal, channel, jnp.asarray(updating_mode), weights, z, self.observed_angles
         )
-        parts = after._replace(mean=align_angles(plant, after.mean, weight))
-        return ModalBeliefs(*self.merging.keep_components(parts, weight, modes), state.moved), innovation
+        gaussians = after._replace(mean=align_angles(plant, after.mean, weight))
+        return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
         """Return the signal of each pair (component, mode) that is corrected, and its weight before."""
@@ -254,8 +254,8 @@ class MultipleModelFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Return the mean and covariance of the whole mixture, angles between -pi and pi, and the modes' law."""
-        weights, parts = state.components
-        mean, covariance = moments_of_mixture(parts.mean, parts.covariance, weights)
+        weights, gaussians = state.components
+        mean, covariance = moments_of_mixture(gaussians.mean, gaussians.covariance, weights)
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim, state.law)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:

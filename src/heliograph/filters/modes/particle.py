@@ -100,10 +100,10 @@ class ParticleFilter(AbstractSizedFilter):
         predicted.
         """
         start, n = at(self.plant, 0), self.particles
-        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
+        gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(
-            gaussian=parts,
+            gaussian=gaussians,
             mode=mode,
             weight=jnp.full(n, 1 / n),
             key=jax.random.PRNGKey(self.seed),
@@ -123,10 +123,10 @@ class ParticleFilter(AbstractSizedFilter):
         uniform = jax.random.uniform(key, state.weight.shape, state.weight.dtype)
         drawn_mode = jax.vmap(invert_distribution)(transition, uniform)
         start = second_moments_at_start(self.plant)
-        parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
+        gaussians = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
         mode = jnp.where(state.moved, drawn_mode, state.mode)
-        parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
-        return Particles(gaussian=parts, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
+        gaussians = gaussians._replace(mean=align_angles(plant, gaussians.mean, state.weight))
+        return Particles(gaussian=gaussians, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:

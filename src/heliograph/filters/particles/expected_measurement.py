@@ -71,7 +71,9 @@ def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Arra
     `predicted`: what particles expect of z, in several arrays; they are numbers if all are finite.
     """
     xp = library(weight, predicted)
-    finite_by_array = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]
+    finite_by_array = [
+        xp.all(xp.isfinite(xp.reshape(expectations, (len(expectations), -1))), axis=1) for expectations in predicted
+    ]
     is_candidate = functools.reduce(xp.logical_and, finite_by_array) & (weight > 0)
     heaviest: Array = xp.argmax(xp.where(is_candidate | ~xp.any(is_candidate), weight, 0.0))
     return heaviest

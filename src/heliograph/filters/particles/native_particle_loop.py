@@ -203,11 +203,11 @@ def _advance_particle(
     of one.
     """
     numbers = jnp.asarray(number)[None]
-    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
-    moved, law = filter.move_particles(one, numbers, row.noise_key, row.u, row.k, row.moved)
-    weighed = filter.weigh_particles(moved, law, numbers, row.proposal_key, row.z, row.k)
+    one_particle = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
+    moved_particle, law = filter.move_particles(one_particle, numbers, row.noise_key, row.u, row.k, row.moved)
+    weighed = filter.weigh_particles(moved_particle, law, numbers, row.proposal_key, row.z, row.k)
     likelihood = jnp.where(is_used, weighed.log_likelihood[0], 0.0)
-    after = jax.tree.map(lambda new, old: jnp.where(is_used, new, old), weighed.particles, moved)
+    after = jax.tree.map(lambda new, old: jnp.where(is_used, new, old), weighed.particles, moved_particle)
     return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
@@ -299,11 +299,11 @@ def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...
         key, proposal_key = filter.keys_of_correction(key, row)
         return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
 
-    first, start_key = filter.start_keys()
-    last, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
-        draw, first if key is None else jnp.asarray(key), jnp.asarray(z)
+    first_key, start_key = filter.start_keys()
+    last_key, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
+        draw, first_key if key is None else jnp.asarray(key), jnp.asarray(z)
     )
-    return start_key, choice_starts, last, noise_keys, proposal_keys
+    return start_key, choice_starts, last_key, noise_keys, proposal_keys
 
 
 _draw_keys_by_xla = quickly_compiled(_draw_keys)
@@ -323,8 +323,8 @@ class _ParticleLoop:
     def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
         """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
         memory, count = self.memory, self.count
-        for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
-            held[:count], held[count:] = new, new[0]  # copies of one particle fill the last lanes
+        for array, values in zip(self.held, jax.tree.leaves(particles), strict=True):
+            array[:count], array[count:] = values, values[0]  # copies of one particle fill the last lanes
         memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
@@ -366,32 +366,32 @@ class _ParticleLoop:
         memory, count = self.memory, self.count
         effective_number = self.sum**2 / self.square
         if not effective_number < self.resample * count:
-            for held, new in self.pairs:
-                new[...] = held
+            for array, next_array in self.pairs:
+                next_array[...] = array
             memory.prior[...] = memory.weight  # weights before z
             return
         chosen = resample_concrete_weights(memory.weight[:count], start)
-        for held, new in self.pairs:
-            np.take(held, chosen, axis=0, out=new[:count], mode="clip")
+        for array, next_array in self.pairs:
+            np.take(array, chosen, axis=0, out=next_array[:count], mode="clip")
         memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
 
     def _advance(self, is_used: bool) -> float:
         """Move all particles, and weigh them by z if the row is used; return the largest log weight."""
         self.memory.used[...] = is_used
         self.programs.advance()
-        for held in (*self.held, *self.predicted):
-            held[self.count :] = held[0]  # copies of one particle fill the last lanes
+        for array in (*self.held, *self.predicted):
+            array[self.count :] = array[0]  # copies of one particle fill the last lanes
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
         """Keep what the heaviest particle before z expects: sums of innovations are taken about it."""
         prior: Any = self.memory.prior
         heaviest: Any = np.argmax(prior)
-        if not all(np.isfinite(expectations[heaviest]).all() for expectations in self.predicted):
-            predicted = tuple(expectations[: self.count] for expectations in self.predicted)
+        if not all(np.isfinite(array_of_expectations[heaviest]).all() for array_of_expectations in self.predicted):
+            predicted = tuple(array_of_expectations[: self.count] for array_of_expectations in self.predicted)
             heaviest = find_reference_particle(prior[: self.count], predicted)
-        for held, new in zip(self.memory.reference, self.predicted, strict=True):
-            held[...] = new[heaviest]
+        for array, expectations_of_all in zip(self.memory.reference, self.predicted, strict=True):
+            array[...] = expectations_of_all[heaviest]
 
     def last_state(self, key: np.ndarray) -> Any:
         """Return the state of the filter after the last row, given the key of what follows."""

@@ -129,8 +129,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         key, choice_key, noise_key = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
         particles = jax.tree.map(lambda leaf: leaf[chosen], self.get_particles(state))
-        moved, _ = self.move_particles(particles, None, noise_key, jnp.asarray(u), k, state.moved)  # None: all
-        return self.make_state(moved, log_weight, key)
+        all_numbers, u = None, jnp.asarray(u)
+        moved_particles, _ = self.move_particles(particles, all_numbers, noise_key, u, k, state.moved)
+        return self.make_state(moved_particles, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
@@ -352,9 +353,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
             of_state = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
-            of_noise = jax.vmap(lambda columns: columns.covariance)(
-                jax.tree.map(lambda leaf: leaf[mode], received.noise)
-            )
+            noise_columns = jax.tree.map(lambda leaf: leaf[mode], received.noise)
+            of_noise = jax.vmap(lambda columns: columns.covariance)(noise_columns)
             return gain @ y + received.offset[mode], of_state + of_noise
 
         expected, total = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)

@@ -236,9 +236,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         `received`: first and second sums of innovations about that of the `reference` particle; `density`: log p(z).
         """
-        first, second = received
+        first_sums_of_innovations, second_sums_of_innovations = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
-        return expected.compute_innovation(first, second, density)
+        return expected.compute_innovation(first_sums_of_innovations, second_sums_of_innovations, density)
 
     def sum_for_mean(self, weight: jax.Array, position: jax.Array) -> StateSums:
         """Return the first sums of positions (B, n)."""

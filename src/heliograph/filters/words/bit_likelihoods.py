@@ -94,14 +94,14 @@ def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]
     `ModeOutput`, the last one.
     """
     outputs = channel.in_parallel
-    mode_outputs = [part for part in outputs if isinstance(part, ModeOutput)]
+    mode_outputs = [output for output in outputs if isinstance(output, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
     # One flag, of the only chain, and last.
     is_told = len(mode_outputs) == 1 and set(chains) == {mode_outputs[0].memory.identity}
     if not is_told or outputs[-1] is not mode_outputs[0] or len(outputs) < 2:
         return []
     modes = next(iter(chains.values())).modes
-    return [Stack([_fix_mode(part, mode) for part in outputs[:-1]]) for mode in range(modes)]
+    return [Stack([_fix_mode(output, mode) for output in outputs[:-1]]) for mode in range(modes)]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:

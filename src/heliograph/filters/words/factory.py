@@ -73,7 +73,7 @@ def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffin
     A word is a number sent in bits, its centre the middle of the range. Outputs that tell a mode are no words; moments
     are those given that the words arrive.
     """
-    word_links = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
+    word_links = [output for output in channel.in_parallel if not isinstance(output, ModeOutput)]
     link = word_links[0] if len(word_links) == 1 else Stack(word_links)
     numbers = link if encoder is None else rewrite_about_centres(encoder, link)
     memoryless = without_memory(first(numbers).condition_on_arrival())

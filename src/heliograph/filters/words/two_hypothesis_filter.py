@@ -75,8 +75,8 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """Predict the Gaussians of both hypotheses: that the last words were right in their leading bits, or not."""
         plant, start = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
         u = jnp.asarray(u)
-        moved = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, start))(state.parts)
-        return state._replace(parts=moved)
+        predicted = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, start))(state.parts)
+        return state._replace(parts=predicted)
 
     @corrects
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:

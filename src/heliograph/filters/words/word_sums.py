@@ -44,10 +44,10 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
         numbers: whole numbers from 0 (...,).
     """
     quotient, likelihood = numbers, jnp.ones(numbers.shape)
-    for zero, one in pairs:
+    for if_zero, if_one in pairs:
         # The lowest binary digit is 1 where the quotient is odd.
         half = jnp.floor(quotient / 2)
-        likelihood = likelihood * jnp.where(quotient > 2 * half, one, zero)
+        likelihood = likelihood * jnp.where(quotient > 2 * half, if_one, if_zero)
         quotient = half
     return jnp.where(quotient > 0, 0.0, likelihood)
 

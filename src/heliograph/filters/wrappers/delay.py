@@ -292,12 +292,12 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
 
     Source: prediction from the last filtered time; equal to augmenting the state with past signals.
     """
-    late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+    delayed_filter = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
-        return with_premise(late, premise)
+        return with_premise(delayed_filter, premise)
     channel = at_each_step(lambda link: delayed(link, delay), premise.channel)
-    return with_premise(late, premise.replaced(channel=channel))
+    return with_premise(delayed_filter, premise.replaced(channel=channel))
 
 
 class KnownDelayFilter(AbstractWrapper):

@@ -92,11 +92,11 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
     """
     scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
-    first, second = moments
+    mean_gain, mean_square_gain = moments
     outer = np.multiply.outer
-    cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
-    mean = first * scaled + fixed
-    joint_second = second * outer(scaled, scaled) + cross + outer(fixed, fixed)
+    cross = mean_gain * (outer(scaled, fixed) + outer(fixed, scaled))
+    mean = mean_gain * scaled + fixed
+    joint_second = mean_square_gain * outer(scaled, scaled) + cross + outer(fixed, fixed)
     return DisturbedGain(mean, joint_second, gain.shape[1])
 
 
@@ -116,7 +116,7 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 
     `index`: which of the parts the map is; in the columns of the others it is zero.
     """
-    private_widths = [other.mean.shape[1] - shared for other in parts]
+    private_widths = [part.mean.shape[1] - shared for part in parts]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
     m, total = gain.mean.shape[0], shared + sum(private_widths)

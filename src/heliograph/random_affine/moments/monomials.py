@@ -242,8 +242,8 @@ class JointMoments(Module):
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
         """Return E[Sym^order(H)] of a lower order: times powers of 1, its monomials are among those of `self.order`."""
-        places = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
-        matrix: jax.Array | np.ndarray = self.matrix[places]
+        positions = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
+        matrix: jax.Array | np.ndarray = self.matrix[positions]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:

@@ -156,6 +156,6 @@ def _choose_product_places(variables: int, degree: int) -> np.ndarray:
     Of several products that give the same monomial, the last.
     """
     table = product_table(variables, degree, degree).reshape(-1)
-    places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
-    places[table] = np.arange(table.size)
-    return places
+    product_positions = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
+    product_positions[table] = np.arange(table.size)
+    return product_positions

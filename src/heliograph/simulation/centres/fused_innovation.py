@@ -105,8 +105,8 @@ def _predict_by_first(
     """
     arrays, static = eqx.partition(filters, eqx.is_array)
     first_arrays, state = jax.tree.map(lambda leaf: leaf[0], (arrays, states))
-    first: AbstractFilter = eqx.combine(first_arrays, static)
-    prior: Gaussian = gaussian_of(first.predict(with_gaussian(state, estimate), u, k))
+    first_filter: AbstractFilter = eqx.combine(first_arrays, static)
+    prior: Gaussian = gaussian_of(first_filter.predict(with_gaussian(state, estimate), u, k))
     return prior
 
 

@@ -250,11 +250,13 @@ def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     for name, (sensor, _, filter) in nodes.items():
-        where = f"fusion by {rule}: node {name!r}"
+        node_in_words = f"fusion by {rule}: node {name!r}"
         if not isinstance(first(sensor), LinearSensor):
-            raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
+            raise fail(node_in_words, "a LinearSensor", type(first(sensor)).__name__)
         if not filter.is_linear:
-            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
+            raise fail(
+                node_in_words, "a filter of the plant's state whose gains depend on no data", type(filter).__name__
+            )
 
 
 def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:

@@ -323,11 +323,11 @@ class Mesh(Module):
 
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
         """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
-        known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
+        has_measurement, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         # In each round a node comes to have what the senders of the messages that arrive had before it.
         for round_number in range(self.edges.rounds):
-            known = jnp.any(known[self.senders] & arrived[:, round_number, :, None], axis=1)
-        return known
+            has_measurement = jnp.any(has_measurement[self.senders] & arrived[:, round_number, :, None], axis=1)
+        return has_measurement
 
     def sum_over_messages(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of the senders whose messages it has.

@@ -294,9 +294,9 @@ def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     `known`: sparse (node, node), a one where the data of the column's node reach the row's. `present`: which messages
     arrive in that exchange (node, degree).
     """
-    receiver, slot = np.nonzero(present)
+    receiver, neighbour_index = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
-    exchange = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, slot])), shape=known.shape)
+    exchange = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, neighbour_index])), shape=known.shape)
     extended = known @ exchange  # `exchange`: a one where the row's node receives the column's
     extended.data = np.minimum(extended.data, 1)
     return extended
@@ -372,5 +372,5 @@ def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node r
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    arrives: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
-    return arrives
+    arrivals: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
+    return arrivals

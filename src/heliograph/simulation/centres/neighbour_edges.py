@@ -203,8 +203,8 @@ def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[s
     `link`: one for all edges, or a link for each by this name.
     """
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
-    what, label = "links between neighbours", "edge SENDER to RECEIVER"
-    return dict(zip(names, spread_over_names(what, link, names, label), strict=True))
+    title, label = "links between neighbours", "edge SENDER to RECEIVER"
+    return dict(zip(names, spread_over_names(title, link, names, label), strict=True))
 
 
 def check_edge(what: str, link: Channel) -> None:

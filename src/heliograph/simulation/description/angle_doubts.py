@@ -50,9 +50,10 @@ def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
         for name, deviation in _yield_deviations(network, filter, covariance):
             if deviation > find_largest_usable_deviation(filter):
                 nodes_by_angle.setdefault((name, label, float(deviation)), []).append(node)
-    for (name, label, known), nodes in nodes_by_angle.items():
+    for (name, label, deviation_at_start), nodes in nodes_by_angle.items():
         first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
-        yield f"wide angle: {label!r} of {first_nodes} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
+        known = f"{name!r} known to +- {deviation_at_start:.2g} rad"
+        yield f"wide angle: {label!r} of {first_nodes} starts with {known}; {REMEDY}"
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
@@ -62,9 +63,9 @@ def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]
         for name, deviation in _yield_deviations(network, filter, covariance):
             wide = np.flatnonzero(deviation > find_largest_usable_deviation(filter))
             if wide.size:
-                known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
+                finding = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
                 rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
-                yield f"{node}/{label}: {known} {rows}; {REMEDY}"
+                yield f"{node}/{label}: {finding} {rows}; {REMEDY}"
 
 
 @readable
@@ -114,8 +115,8 @@ class WideAngles:
         for i in list(self.states):
             rows_of_wide = np.flatnonzero(variances[:, i] > self._largest_usable**2)
             if rows_of_wide.size:
-                known = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
-                doubts.append((int(rows_of_wide[0]), f"{known}; {REMEDY}"))
+                finding = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
+                doubts.append((int(rows_of_wide[0]), f"{finding}; {REMEDY}"))
         return doubts
 
 

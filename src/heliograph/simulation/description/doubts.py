@@ -132,16 +132,18 @@ def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
     yield from _doubt_error_bound(network, "the mean error of every filter", serious=True)
-    alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
-    if len(network.nodes) == 1 or not alone:
+    nodes_with_filters = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
+    if len(network.nodes) == 1 or not nodes_with_filters:
         return
-    if len(alone) > NODES_LIMIT:
-        yield Doubt(serious=False, words=f"boundedness of each node alone: not judged of {len(alone)} nodes")
+    if len(nodes_with_filters) > NODES_LIMIT:
+        yield Doubt(
+            serious=False, words=f"boundedness of each node alone: not judged of {len(nodes_with_filters)} nodes"
+        )
         return
-    for name in alone:
+    for name in nodes_with_filters:
         node = network.nodes[name]
-        alone_network = Network(network.plant, {name: node})
-        yield from _doubt_error_bound(alone_network, f"the mean error of {name!r} alone", serious=not network.fused)
+        network_of_node = Network(network.plant, {name: node})
+        yield from _doubt_error_bound(network_of_node, f"the mean error of {name!r} alone", serious=not network.fused)
 
 
 def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
@@ -208,9 +210,9 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
         if not isinstance(node, Node) or not node.filters:
             continue
         for affine in list_told_maps(first(node.channel)):
-            if why := affine.reason_for_no_claim:
-                what = join_names([repr(number) for number in affine.names])
-                yield Doubt(serious=True, words=f"told: {what} at {name!r} {why}, so that claims are nominal")
+            if reason := affine.reason_for_no_claim:
+                numbers = join_names([repr(number) for number in affine.names])
+                yield Doubt(serious=True, words=f"told: {numbers} at {name!r} {reason}, so that claims are nominal")
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:

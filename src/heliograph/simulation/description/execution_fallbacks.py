@@ -34,8 +34,8 @@ def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
     """Yield each filter of the network, with who it is in words."""
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
     filters_by_place = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
-    for where, filters in (*filters_by_place, ("", central)):
-        yield from ((f"filter {label!r}{where}", filter) for label, filter in filters.items())
+    for place_in_words, filters in (*filters_by_place, ("", central)):
+        yield from ((f"filter {label!r}{place_in_words}", filter) for label, filter in filters.items())
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:

@@ -20,7 +20,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
 
     Rounded to single precision; of each model only the first such number is named.
     """
-    parts: dict[tuple[float, float], list[str]] = {}
+    names_by_number: dict[tuple[float, float], list[str]] = {}
     first_rounded: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models_with_calls(network):
         if id(model) not in first_rounded:
@@ -28,8 +28,8 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
             first_rounded[id(model)] = next(filter(None, found), None)
         rounded = first_rounded[id(model)]
         if rounded is not None:
-            parts.setdefault(rounded, []).append(name)
-    return parts
+            names_by_number.setdefault(rounded, []).append(name)
+    return names_by_number
 
 
 def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:

@@ -55,10 +55,10 @@ def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, 
         _, grid = plt.subplots(count, 1, squeeze=False, sharex=True, layout="constrained", figsize=size)
         grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else label_with_unit("time", units))
         return list(grid[:, 0])
-    given = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(given) != count:
-        raise fail("axes", f"{count}, one for each state", len(given))
-    return given
+    panels = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(panels) != count:
+        raise fail("axes", f"{count}, one for each state", len(panels))
+    return panels
 
 
 def check_run(run: int, runs: int | None) -> None:

@@ -165,8 +165,8 @@ class Record(SavableResults):
     def check_filter(self, node: str, name: str) -> None:
         """Raise ValueError unless the node has a filter of this name."""
         if name not in self.estimates.get(node, {}):
-            known = [f"{element}/{label}" for element, filters in self.estimates.items() for label in filters]
-            raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
+            available = [f"{node_name}/{label}" for node_name, filters in self.estimates.items() for label in filters]
+            raise fail("node and filter", f"one of {', '.join(available)}", f"{node}/{name}")
 
     def rmse(self, node: str, name: str) -> dict[str, float]:
         """Return the root mean square error of each state, in its unit, over runs and the steps whose truth is known.
@@ -204,7 +204,7 @@ class Record(SavableResults):
         """
         self.check_filter(node, name)
         if name not in self.weighed.get(node, {}):
-            weighing = [f"{element}/{label}" for element, filters in self.weighed.items() for label in filters]
+            weighing = [f"{node_name}/{label}" for node_name, filters in self.weighed.items() for label in filters]
             raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
         return self.weighed[node][name].summarise()
 

@@ -49,9 +49,9 @@ class ErrorStatistics:
         """In words, from which step on and in how many runs estimates were not valid; empty where all were."""
         if not self.failed_runs:
             return ""
-        what = "mean" if self.claim == "none" else "covariance"
+        moment = "mean" if self.claim == "none" else "covariance"
         step = 0 if self.failed is None else int(np.argmax(self.failed > 0))
-        return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
+        return f"no valid {moment} from step {step} in {self.failed_runs} of {self.runs} runs"
 
     def _warn_of_failures(self) -> None:
         """Warn, at the caller of a public method, that figures are NaN since some run had no valid estimate."""

@@ -46,9 +46,9 @@ class RowHistory(NamedTuple):
 
     def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
         """Return the inputs that led to a row: those held before it, with the time since then at place `dt`."""
-        held = self.held[row - 1]
+        held_inputs = self.held[row - 1]
         (_, _, time), (_, _, time_before) = self.read_row(row), self.read_row(row - 1)
-        return jnp.concatenate([held[:dt], (time - time_before)[None], held[dt:]])
+        return jnp.concatenate([held_inputs[:dt], (time - time_before)[None], held_inputs[dt:]])
 
     def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return measurements and inputs at step k, which is the row's or one between it and the row before.
@@ -57,6 +57,6 @@ class RowHistory(NamedTuple):
         row does not give (NaN).
         """
         z, u_of_row, step_of_row = self.read_row(row)
-        is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(is_row, jnp.where(jnp.isnan(u_of_row), held, u_of_row), held)
+        is_row, held_inputs = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
+        u = jnp.where(is_row, jnp.where(jnp.isnan(u_of_row), held_inputs, u_of_row), held_inputs)
         return jnp.where(is_row, z, jnp.nan), u

@@ -309,7 +309,7 @@ def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> E
     "none" where its mean is no number or its covariance is none.
     """
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
-    mean, covariance = (np.asarray(part)[index] for part in (outputs.mean, outputs.covariance))
+    mean, covariance = (np.asarray(stacked_values)[index] for stacked_values in (outputs.mean, outputs.covariance))
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 

@@ -89,9 +89,9 @@ class RowLayout(NamedTuple):
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
         """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
-        state, rest = row[: self.state.size], row[self.state.size :]
-        z, u = rest[: self.received], rest[self.received : self.received + self.inputs]
-        k = rest[-1].astype(np.int64)
+        state, data_of_row = row[: self.state.size], row[self.state.size :]
+        z, u = data_of_row[: self.received], data_of_row[self.received : self.received + self.inputs]
+        k = data_of_row[-1].astype(np.int64)
         return self.state.tree(state), z, u, k
 
 

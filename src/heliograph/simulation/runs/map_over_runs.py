@@ -64,12 +64,12 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
         Missing runs are filled up, and their results are cut off again. Closed over: the `function` of one run, and
         its arguments `values`, each (runs, ...).
         """
-        first, stop = core * share, min((core + 1) * share, runs)
-        padded = [_pad_runs(a[first:stop], share) for a in values]
+        first_run, stop_run = core * share, min((core + 1) * share, runs)
+        padded = [_pad_runs(a[first_run:stop_run], share) for a in values]
         by_block = [a.reshape(blocks, width, *a.shape[1:]) for a in padded]
         with jax.enable_x64(True):
             outputs = to_numpy(_map_blocks(function, by_block))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: stop - first], outputs)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: stop_run - first_run], outputs)
 
     # Each core computes its blocks, then copies them to their place; few runs need fewer cores.
     computed = list(get_thread_pool().map(compute_share, range(-(-runs // share))))

@@ -61,14 +61,14 @@ def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
     The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
     than to simulate three hundred runs, and so would to split the network again for each simulation of it.
     """
-    parts = []
+    networks_with_worlds = []
     for names in network.groups:
         network_of_group = _select_nodes(network, names)
         world = jax.tree.map(_on_host, build_world(network_of_group))
         for start in range(0, len(names), NODES):
-            part = slice(start, start + NODES)
-            parts.append((_select_nodes(network, names[part]), _select_rows(world, part)))
-    return tuple(parts)
+            node_range = slice(start, start + NODES)
+            networks_with_worlds.append((_select_nodes(network, names[node_range]), _select_rows(world, node_range)))
+    return tuple(networks_with_worlds)
 
 
 def _on_host(leaf: PyTree) -> PyTree:
