@@ -197,7 +197,7 @@ def _update_by_rows_in_loop(
         rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
         least = propagate_slope_rounding(least, gain[n:], rounding)
         news = news + gain * innovation
-        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, 0)
+        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, i=0)
         return carry, (innovation, variance_of_row)
 
     # -1 is below every variance: before the first row nothing was rounded.

@@ -230,7 +230,7 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
 
     hg.run judges each value; this call does not.
     """
-    is_invalid = find_not_finite(mean, 1)
+    is_invalid = find_not_finite(mean, axes=1)
     if is_invalid.any():
         row = begin + int(np.argmax(is_invalid)) + 1
         finding = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"

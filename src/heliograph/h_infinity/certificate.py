@@ -82,7 +82,7 @@ def certify_level(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, TINY, LARGEST))
+    level = float(scalar("level", level, low=TINY, high=LARGEST))
     findings = {"f": _list_findings("growth", growth), "h": _list_findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))

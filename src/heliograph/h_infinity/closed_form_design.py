@@ -33,7 +33,7 @@ def known_channel_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, TINY, GREATEST))
+    level = float(scalar("level", level, low=TINY, high=GREATEST))
     if any(len(link.spreads()) for link in system.channel):
         raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
     shape = (system.steps, 2)

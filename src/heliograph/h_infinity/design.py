@@ -100,7 +100,7 @@ def recursive_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    target = None if level is None else float(scalar("level", level, TINY, LARGEST))
+    target = None if level is None else float(scalar("level", level, low=TINY, high=LARGEST))
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _check_initial_weight(initial, system.states)

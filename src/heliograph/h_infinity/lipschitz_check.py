@@ -143,7 +143,7 @@ def check_growth(
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
-    constant = float(scalar("growth constant", constant, 0.0))
+    constant = float(scalar("growth constant", constant, low=0.0))
     bottom, top = _check_box(low, high)
     differences = flag("differences", differences)
     seed = check_seed("seed", seed)

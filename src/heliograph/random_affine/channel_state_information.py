@@ -99,7 +99,7 @@ class FreshReading(AbstractFreshDraw):
         """Hold the law of the gain g and the variance of the reading error e."""
         self.law = require_density(law)
         self.variance = scalar("noise of a pilot", variance, np.finfo(float).tiny)
-        self.name, self.identity = None, identify_memory(None)
+        self.name, self.identity = None, identify_memory(name=None)
 
     def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         """Return the reading."""

@@ -24,7 +24,7 @@ class Erasure(AbstractMapWrapper):
     def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
         """Hold the map `base` and the probability `arrival` that its outputs are received."""
         (self.base,) = check_maps("erasure", [base])
-        self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
+        self.arrival = scalar("arrival probability", arrival, low=0.0, high=1.0)
 
     @property
     def erases(self) -> bool:

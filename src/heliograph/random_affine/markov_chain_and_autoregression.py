@@ -292,7 +292,7 @@ class Autoregression(AbstractMemory):
 
         Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
         """
-        n = check_count("modes of a fading", modes, 2) - 1
+        n = check_count("modes of a fading", modes, least=2) - 1
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
         rows = []

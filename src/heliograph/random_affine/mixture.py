@@ -132,7 +132,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
         moments = self.moments(2)
         mean = moments.mean
-        noise_products = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
+        noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
         second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
         noise = Gaussian(second_moment - offset[:, None] * offset, offset)

@@ -198,7 +198,7 @@ class Faded(AbstractHop, AbstractModal):
         if not isinstance(drift, Autoregression):
             raise fail("drift", "an Autoregression", show_value(drift))
         self.memory, self.mean = drift, scalar("mean gain", mean)
-        self.deviation = scalar("deviation of the gain", deviation, 0.0)
+        self.deviation = scalar("deviation of the gain", deviation, low=0.0)
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 

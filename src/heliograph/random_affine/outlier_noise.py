@@ -45,7 +45,7 @@ class StudentT(AbstractNoise):
     def __init__(self, scale: ArrayLike, degrees: ArrayLike):
         """Hold the scale matrix and the degrees of freedom nu; the mean is zero."""
         self.scale = check.covariance("scale of Student's law", scale, _size_of_number(scale))
-        self.degrees = scalar("degrees of Student's law", degrees, TINY)
+        self.degrees = scalar("degrees of Student's law", degrees, low=TINY)
         self.mean = np.zeros(self.scale.shape[-1])
 
     @property  # type: ignore[misc]
@@ -176,7 +176,7 @@ class Contaminated(AbstractNoise):
         slice_means, slice_variances = _slice_exponential(count)
         xp = library(factor, inlier, share)
         direction = xp.broadcast_to(factor, (n,))
-        slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
+        slice_share = scalar("share of outliers", share, low=0.0, high=1.0) / count
         # A slice adds its mean to the noise, and its variance along `direction` to the covariance.
         covariances = [inlier + v * xp.outer(direction, direction) for v in slice_variances]
         return cls(
@@ -281,13 +281,13 @@ def _size_of_number(value: ArrayLike) -> int | None:
 def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
     """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
     if not rank("share of outliers", share):
-        return [scalar("share of outliers", share, 0.0, 1.0)], False
+        return [scalar("share of outliers", share, low=0.0, high=1.0)], False
     values = array("shares of outliers", share, ("kinds",))
     if not len(values):
         raise fail("shares of outliers", "at least one", "none")
-    total = sum(scalar("share of outliers", value, 0.0, 1.0) for value in values)
+    total = sum(scalar("share of outliers", value, low=0.0, high=1.0) for value in values)
     if not is_traced(total):
-        scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12)  # raises where it is above 1
+        scalar("sum of the shares of outliers", total, low=0.0, high=1.0 + 1e-12)  # raises where it is above 1
     return list(values), True
 
 

@@ -34,7 +34,7 @@ class Rotation(AbstractRandomAffine):
 
     def __init__(self, deviation: "Float[ArrayLike, '']"):
         """Hold the standard deviation of the phase in rad."""
-        self.deviation = scalar("deviation of a phase", deviation, 0.0)
+        self.deviation = scalar("deviation of a phase", deviation, low=0.0)
 
     @property
     def outputs(self) -> int:
@@ -65,7 +65,7 @@ class Rotation(AbstractRandomAffine):
         to_complex = symmetric_power(TO_COMPLEX, order)
         from_complex = symmetric_power(np.linalg.inv(TO_COMPLEX), order)
         matrix = (np.asarray(from_complex) * factors) @ to_complex
-        return JointMoments(matrix.real, 2, 2, order)
+        return JointMoments(matrix.real, outputs=2, inputs=2, order=order)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map as it is, and the place as it was: it has no transmitter."""

@@ -95,7 +95,7 @@ class Node(Module):
         timeout: float | None = None,
     ):
         """Check that sensor, channel, trigger, encoder and filters fit, and find what the filters receive."""
-        self.timeout = None if timeout is None else float(scalar("timeout", timeout, TINY))
+        self.timeout = None if timeout is None else float(scalar("timeout", timeout, low=TINY))
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         # Sensor and channel fit.

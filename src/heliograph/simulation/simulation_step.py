@@ -39,7 +39,7 @@ class World(Module):
         A tuple: state x of the plant (n,); of the medium, which is all channels; of all filters; of the links between
         neighbours, by fusion; of the plant's memories, its modes.
         """
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         if isinstance(plant, ModalPlant) and plant.rates is not None:
             expected = "transitions of a plant's modes by steps (with rates filter recordings, simulate T = exp(G dt))"
             raise fail("simulation", expected, "rates of switches")

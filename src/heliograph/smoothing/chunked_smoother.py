@@ -54,7 +54,7 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
-        chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
+        chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
         if chunk_starts is None:
             return None
         return _smooth_all(SmootherStepRecursion(filter, chunk_starts.lengths.chunk), chunk_starts, rows)

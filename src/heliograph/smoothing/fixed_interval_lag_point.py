@@ -146,7 +146,7 @@ class FixedLag(AbstractSmoothing):
 
     def __init__(self, lag: int):
         """Hold the lag: the number of later steps whose data each smoothed estimate uses."""
-        self.lag = check_count("lag", lag, 0)
+        self.lag = check_count("lag", lag, least=0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time, ...)."""
@@ -167,7 +167,7 @@ class FixedPoint(AbstractSmoothing):
 
     def __init__(self, step: int):
         """Hold the number of the one time step whose state is smoothed."""
-        self.step = check_count("step of a fixed point", step, 0)
+        self.step = check_count("step of a fixed point", step, least=0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time from that step on, ...)."""

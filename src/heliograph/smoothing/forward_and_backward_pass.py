@@ -44,7 +44,7 @@ def smoother_steps(
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)
-    first = np.asarray(check_count("first step", first_step, 0))
+    first = np.asarray(check_count("first step", first_step, least=0))
     start = filter.init() if state is None else state
     return filter_rows_with_smoother_steps(filter, z, u, start, first)
 

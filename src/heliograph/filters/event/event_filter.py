@@ -97,7 +97,7 @@ class EventFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> EventBelief:
         """Return the prior of (x, r), x the plant's state and r the reference of the sender: none was sent yet."""
-        start, m = at(self.plant, 0), self.outputs
+        start, m = at(self.plant, k=0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
         known_reference = WeightedColumns(np.eye(m), jnp.zeros(m))
         joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0

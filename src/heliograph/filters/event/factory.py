@@ -70,7 +70,7 @@ def event_filter(
     check_link(first(sensor), first(channel), len(start.states))
     refuse_angles("event filter", plant, sensor)
     trigger.check_outputs(len(first(sensor).outputs))
-    known, lost = check_count("known", known), check_count("lost", lost, 0)
+    known, lost = check_count("known", known), check_count("lost", lost, least=0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     # Law of what arrives at each step, by mode of the link and by which components arrive.
     described, initial = _describe_channel(channel)

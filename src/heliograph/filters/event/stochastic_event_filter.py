@@ -70,7 +70,7 @@ class StochasticEventFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> StochasticBelief:
         """Return the prior: of x, and of the link's modes (`law`); nothing was sent or predicted (`moved`) yet."""
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(
             gaussian=x, law=jnp.asarray(self.initial), reference=jnp.zeros(self.outputs), moved=jnp.asarray(False)

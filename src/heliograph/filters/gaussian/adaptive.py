@@ -90,7 +90,7 @@ class AdaptiveFilter(AbstractWrapper):
         PRIOR_SHAPE: the shape of that law, 3, as much as six noises say.
         """
         shape = jnp.full(self.received, PRIOR_SHAPE)
-        variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
+        variance = jnp.diagonal(jnp.asarray(at(self.noise, k=0).covariance))
         return AdaptiveBelief(self.base.init(), shape, shape * variance)
 
     @predicts
@@ -291,7 +291,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     if not isinstance(filter, GaussianFilter | RobustFilter):
         expected = "one of kalman_filter, extended_filter, cubature_filter or robust_filter"
         raise fail("filter to adapt", expected, type(filter).__name__)
-    stored = scalar("memory of an adaptive filter", memory, TINY, 1.0)
+    stored = scalar("memory of an adaptive filter", memory, low=TINY, high=1.0)
     noise = filter.noise if isinstance(filter, RobustFilter) else _find_sensor_noise(filter)
     adaptive = AdaptiveFilter(
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,

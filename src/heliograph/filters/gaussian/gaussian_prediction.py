@@ -100,7 +100,7 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
     `start`: whose law of the first state counts, by default the plant's; of a law that is partly unknown, the known
     part. A noise that depends on inputs counts where it is added.
     """
-    first_step = at(plant, 0)
+    first_step = at(plant, k=0)
     if isinstance(first_step, ModalPlant):  # the largest of the models
         return reduce(jnp.maximum, [second_moments_at_start(model, start) for model in first_step.models])
     start = first_step if start is None else start

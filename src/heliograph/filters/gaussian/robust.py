@@ -51,7 +51,7 @@ class Huber(AbstractWeightingRule):
 
     def __init__(self, c: "Float[ArrayLike, '']" = 1.345):
         """Hold c, the normalised innovation |d| beyond which a measurement's weight falls as c / |d|."""
-        self.c = scalar("constant of Huber's rule", c, TINY)
+        self.c = scalar("constant of Huber's rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return min(1, c / |d|)."""
@@ -69,7 +69,7 @@ class InverseMultiquadric(AbstractWeightingRule):
 
     def __init__(self, c: "Float[ArrayLike, '']" = 3.0):
         """Hold c, the normalised innovation |d| at which the weight 1 / (1 + d^2 / c^2) is a half."""
-        self.c = scalar("constant of the inverse multiquadric rule", c, TINY)
+        self.c = scalar("constant of the inverse multiquadric rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return 1 / (1 + d^2 / c^2)."""
@@ -86,7 +86,7 @@ class WoLF(AbstractWeightingRule):
 
     def __init__(self, c: "Float[ArrayLike, '']"):
         """Hold c, the innovation in deviations of the noise at which the weight 1 / (1 + e^2 / (c^2 r)) is a half."""
-        self.c = scalar("constant of the weighted likelihood filter", c, TINY)
+        self.c = scalar("constant of the weighted likelihood filter", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return 1 / (1 + e^2 / (c^2 r))."""
@@ -111,9 +111,9 @@ class Gate(AbstractWeightingRule):
 
     def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
         """Keep c, the limit of a squared innovation over its variance, and when the gate gives in (None: never)."""
-        self.c = scalar("limit of the gate", c, TINY)
+        self.c = scalar("limit of the gate", c, low=TINY)
         self.after = None if after is None else check_count("after, of a gate", after)
-        self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, TINY))
+        self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, low=TINY))
 
     @property
     def gives_in(self) -> bool:

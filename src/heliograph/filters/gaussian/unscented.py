@@ -52,7 +52,7 @@ class Unscented(AbstractTransform):
 
     def __init__(self, alpha: Scalar = 1.0, beta: Scalar = 2.0, kappa: Scalar = 0.0):
         """Hold the scaling parameters alpha, beta and kappa of the unscented transform."""
-        self.alpha, self.beta = scalar("alpha", alpha, TINY), scalar("beta", beta)
+        self.alpha, self.beta = scalar("alpha", alpha, low=TINY), scalar("beta", beta)
         self.kappa = scalar("kappa", kappa)
 
     def check(self, n: int) -> None:

@@ -162,7 +162,7 @@ def find_model_matrices(
 
 def _find_initial_moments(filter: Any) -> MomentSlopes:
     """Return the mean and covariance before the first step."""
-    plant = at(filter.plant, 0)
+    plant = at(filter.plant, k=0)
     return MomentSlopes(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
 
 

@@ -80,7 +80,7 @@ class LinearFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> LinearBelief:
         """Return the prior, both as estimate and as the state's moments before data."""
-        return prior_belief(at(self.plant, 0))
+        return prior_belief(at(self.plant, k=0))
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:

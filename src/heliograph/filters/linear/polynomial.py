@@ -301,7 +301,7 @@ class MemoryFilter(AbstractSizedFilter):
         """
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
-        monomials = evaluate_monomials(z, 2)[:-1]  # z and its squares, without the constant
+        monomials = evaluate_monomials(z, degree=2)[:-1]  # z and its squares, without the constant
         lifted = jnp.concatenate([monomials, jnp.outer(z, linear.mean).reshape(-1)])
         products, innovation = self.products.correct(state.products, lifted, k)
         return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, degree=2)

@@ -86,7 +86,7 @@ class AdditiveModalFilter(AbstractModalFilter):
     @compile_on_call
     def init(self) -> AdditiveBelief:
         """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         spread = pad_with_zeros(jnp.asarray(start.initial_covariance))
         laws = tuple(jnp.asarray(law) for law in self.initial)
         second = spread.at[-1, -1].set(1.0)

@@ -123,7 +123,7 @@ class MixtureFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> MixtureBelief:
         """Return the prior, and the initial law of the modes; `moved`: no step was predicted yet."""
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
@@ -236,7 +236,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
     # All combinations of atoms, mode by mode, for each step where they vary; one step stands for all where none do.
-    added_variance = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2
+    added_variance = float(scalar("resolution", resolution, low=0.0, high=1e100)) ** 2
     steps = steps_covered((sensor, channel)) or 1
     modes = [_joint_modes_of(now) for now in list_models_by_step(channel, steps)]
     modes_before = [modes[0], *modes[:-1]]

@@ -145,7 +145,7 @@ class ModalFilter(AbstractJointModalFilter):
 
         State and mode are independent at the start.
         """
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior, second_moment = compute_initial_moments(start, self.initial)
         moments, centre = law[:, None, None] * second_moment, jnp.asarray(start.initial_mean)
         return ModalBelief(gaussian=prior, moments=moments, centre=centre, moved=jnp.asarray(False))

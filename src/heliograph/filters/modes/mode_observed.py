@@ -80,7 +80,7 @@ class ModeObservedFilter(AbstractSizedFilter):
 
         Nothing was received (z is NaN), and the last step moved nothing (matrix I, no noise).
         """
-        belief = prior_belief(at(self.plant, 0))
+        belief = prior_belief(at(self.plant, k=0))
         n = len(belief.gaussian.mean)
         zeros = jnp.zeros((n, n))
         no_noise = WeightedColumns(zeros, jnp.zeros(n))

@@ -181,7 +181,7 @@ class MultipleModelFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> ModalBeliefs:
         """Return the prior in every component, and the initial law of the modes; no step was predicted (`moved`)."""
-        start, weight = at(self.plant, 0), self.merging.initial_weights(jnp.asarray(self.initial))
+        start, weight = at(self.plant, k=0), self.merging.initial_weights(jnp.asarray(self.initial))
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
         return ModalBeliefs(gaussians, weight, moved=jnp.asarray(False))
 

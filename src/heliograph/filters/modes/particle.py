@@ -99,7 +99,7 @@ class ParticleFilter(AbstractSizedFilter):
         Particle i of n has the mode at the share (i + 1/2) / n of the distribution. `moved`: whether a step was
         predicted.
         """
-        start, n = at(self.plant, 0), self.particles
+        start, n = at(self.plant, k=0), self.particles
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(
@@ -224,6 +224,6 @@ def particle_filter(
         return build_state_particles(plant, sensor, channel, count, seed, proposal, resample)
     return ParticleFilter(
         particles=check_count("particles", FEW if particles is None else particles),
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **fields_of_mode_filters(plant, sensor, channel, transform, nodes),
     )

@@ -106,7 +106,7 @@ class SideInformationFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> SideInformationBelief:
         """Return the prior, in which state and mode are independent; x~ = (x - c, 1), p the law of the modes."""
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         unit = np.eye(len(self.states) + 1)[:, -1:]
         # Columns of q = (e, x~) in each mode: e, the error of (x~ 1{mode 1}, ...), is 1_j (x) x~ - p (x) (0, 1).

@@ -69,7 +69,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
         `low`, `high`: ends of the modes' law, equal at the start; `second_moment`: E[x~ x~'], x~ = (x - centre, 1).
         """
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior, second_moment = compute_initial_moments(start, self.initial)
         centre = jnp.asarray(start.initial_mean)
         return UncertainBelief(

@@ -68,7 +68,7 @@ def build_partly_drawn(
         density=vary_over_steps(densities, sensor, channel),
         initial=joint.initial,
         transition=joint.transition,
-        resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
+        resample=np.asarray(scalar("resample", resample, low=0.0, high=1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         plant_modes=find_models("plant", plant, [model for model, _ in joint.beside]),
         sensor_modes=sensor_modes,
@@ -76,7 +76,7 @@ def build_partly_drawn(
         drawn=len(drawn_places),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **make_sizes("nominal", start, first(channel).outputs),
     )
 

@@ -115,7 +115,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
         """Return the law of x_0 for the particles of these numbers (B,), drawn states first, in every mode."""
-        plants, count, order = list_mode_models(at(self.plant, 0)), len(numbers), np.array(self.order)
+        plants, count, order = list_mode_models(at(self.plant, k=0)), len(numbers), np.array(self.order)
         prior = from_covariance(plants[0].initial_mean[order], plants[0].initial_covariance[order][:, order])
         x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), prior)
         if not self._is_linear(plants):

@@ -109,7 +109,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         Each number has a random key of its own, so that one particle's draw does not depend on how many there are.
         """
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         drawn: jax.Array = jax.vmap(lambda number: plant.sample_initial(jax.random.fold_in(key, number)))(numbers)
         return drawn
 
@@ -161,7 +161,7 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         start_moved = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
         center = jnp.where(moved, law.center, mean)
@@ -300,11 +300,11 @@ def build_state_particles(
         plant=plant,
         sensor=sensor,
         density=vary_over_steps(densities, sensor, channel),
-        resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
+        resample=np.asarray(scalar("resample", resample, low=0.0, high=1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **make_sizes("nominal", start, first(channel).outputs),
     )
 

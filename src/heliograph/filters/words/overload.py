@@ -90,10 +90,10 @@ def bound_overload(
         encoder: of the words.
         places: component of each output of the channel.
     """
-    link = at(numbers, 0)
+    link = at(numbers, k=0)
     no_bound = link.past or link.remembers or any(place < 0 for place in places)
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
-    outputs = len(at(sensor, 0).outputs)
+    outputs = len(at(sensor, k=0).outputs)
     step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
     links = None if no_bound else _list_links(numbers, horizon)
     system, signals = _describe_system(plant, sensor, links, horizon)
@@ -112,7 +112,7 @@ def _describe_system(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, horizon: int
 ) -> tuple[LinearSystem | None, list[tuple[np.ndarray, np.ndarray]]]:
     """Return plant, sensor and links, where given, as a linear system, and mean and variance of y - c at each step."""
-    start = at(plant, 0)
+    start = at(plant, k=0)
     mean, covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
     x, spread = mean, covariance
     parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()

@@ -20,7 +20,7 @@ class Rayleigh(AbstractLaw):
 
     def __init__(self, scale: "Float[ArrayLike, '']"):
         """Hold the standard deviation of the complex Gaussian's real part, which is its imaginary part's too."""
-        self.scale = scalar("Rayleigh scale", scale, 0.0)
+        self.scale = scalar("Rayleigh scale", scale, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw scale * sqrt(-2 log u)."""
@@ -51,7 +51,7 @@ class Rician(AbstractLaw):
 
     def __init__(self, sight: "Float[ArrayLike, '']", scale: "Float[ArrayLike, '']"):
         """Hold the line of sight's amplitude and the standard deviation of the scatter's real and imaginary part."""
-        self.sight = scalar("Rician line of sight", sight, 0.0)
+        self.sight = scalar("Rician line of sight", sight, low=0.0)
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -111,8 +111,8 @@ class Nakagami(AbstractLaw):
 
     def __init__(self, shape: "Float[ArrayLike, '']", power: "Float[ArrayLike, '']" = 1.0):
         """Hold the shape m, at least 1/2, and the mean power E[g^2]."""
-        self.shape = scalar("Nakagami shape", shape, 0.5)
-        self.power = scalar("Nakagami power", power, 0.0)
+        self.shape = scalar("Nakagami shape", shape, low=0.5)
+        self.power = scalar("Nakagami power", power, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the root of a gamma variable with shape m and mean `power`."""
@@ -154,7 +154,7 @@ class LogNormal(AbstractLaw):
     def __init__(self, log_mean: "Float[ArrayLike, '']", log_deviation: "Float[ArrayLike, '']"):
         """Hold mean and standard deviation of log g."""
         self.log_mean = scalar("log-normal mean", log_mean)
-        self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
+        self.log_deviation = scalar("log-normal deviation", log_deviation, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw exp(log_mean + log_deviation n)."""

@@ -267,7 +267,7 @@ def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']
     Raises:
         ValueError: a probability outside [0, 1], or a radius that it does not allow.
     """
-    p = scalar("probability that a link works", probability, 0.0, 1.0)
+    p = scalar("probability that a link works", probability, low=0.0, high=1.0)
     return Discrete([0.0, 1.0], [1 - p, p], radius)
 
 

@@ -234,8 +234,8 @@ class JointMoments(Module):
     def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
         """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); order 2."""
         # Where the monomials z_i z_j and Y_a Y_b stand in the matrix.
-        rows = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
-        columns = product_table(self.inputs + 1, 1, 1)
+        rows = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
+        columns = product_table(self.inputs + 1, first=1, second=1)
         shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
         tensor: jax.Array | np.ndarray = self.matrix[rows[:, :, None, None], columns] / shares
         return tensor

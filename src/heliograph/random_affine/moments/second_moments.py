@@ -306,9 +306,9 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_spreads(spreads)
     # Spreads of a sum add up, and that of its noise.
-    mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), 1), channel.inputs + 1
+    mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
-    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), 2) + noise
+    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
     return mean_of_maps + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
@@ -352,7 +352,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     """
     # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
     every = range(len(parts))  # numbers of the parts
-    mean = channel.sum_in_places({i: parts[i].mean for i in every}, 1)
+    mean = channel.sum_in_places({i: parts[i].mean for i in every}, axes=1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * _make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
@@ -390,7 +390,7 @@ def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, An
     `weighted`: by the number of a part (a map that the channel sums), its second-moment map and its weight.
     """
     scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
-    center = channel.sum_in_places({i: moment_map.center for i, moment_map in scaled.items()}, 2)
+    center = channel.sum_in_places({i: moment_map.center for i, moment_map in scaled.items()}, axes=2)
     return QuadraticMap(center, channel.sum_in_places({i: moment_map.radius for i, moment_map in scaled.items()}, 2))
 
 

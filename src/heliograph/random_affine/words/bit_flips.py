@@ -178,4 +178,4 @@ def _read_error_rate(rate: object) -> Constant | Discrete:
     value = rate.value if isinstance(rate, Constant) else rate
     if np.ndim(value):  # type: ignore[arg-type]
         raise fail("error rate of a hop", f"{expected}; with other rates a word's mean is not affine in it", "several")
-    return Constant(scalar("error rate of a hop", value, 0.0, 0.5))  # type: ignore[arg-type]
+    return Constant(scalar("error rate of a hop", value, low=0.0, high=0.5))  # type: ignore[arg-type]

@@ -162,7 +162,7 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
         return tests
-    places, plant = network.places, at(network.plant, 0)
+    places, plant = network.places, at(network.plant, k=0)
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":

@@ -81,7 +81,7 @@ class FusionCentre(Module):
 
         `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
         """
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         initial_means = jnp.concatenate(starts)[self.order]
         errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, initial_means)
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})

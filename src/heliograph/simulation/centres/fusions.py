@@ -70,7 +70,7 @@ class StackedFusions(Module):
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
-        init_of_nodes = map_all(lambda quantizer: at(quantizer, 0).init(n), nodes)
+        init_of_nodes = map_all(lambda quantizer: at(quantizer, k=0).init(n), nodes)
         return map_all(init_of_nodes, fusions)(self.quantizers)
 
     def step(

@@ -61,7 +61,7 @@ class LinearisedCentre(Module):
 
         `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
         """
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         initial_means = jnp.concatenate(starts)[self.order]
         errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, initial_means)
         mean = jnp.asarray(plant.initial_mean)

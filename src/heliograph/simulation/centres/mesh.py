@@ -91,7 +91,7 @@ class Mesh(Module):
 
     def init(self) -> MeshState:
         """Return the state before the first step: the plant's mean and covariance at every node."""
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
         # Before any data all nodes' errors are the same.

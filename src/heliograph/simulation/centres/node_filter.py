@@ -247,7 +247,7 @@ def node_network(network: Network, node: str) -> Network:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
     received = {j: _count_message_numbers(len(network.states), network.nodes[j].received) for j in senders}
-    parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
+    parts = {j: ReceivingNode(filters={}, received=size, outputs=(), complete=False) for j, size in received.items()}
     return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
 
 

@@ -105,7 +105,7 @@ def relay_tree(
 
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
-    check_count("degree of a tree", degree, 2)
+    check_count("degree of a tree", degree, least=2)
     function("node", node, "the numbers of one leaf that returns a Node")
     count, steps = _count_leaves(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):

@@ -88,7 +88,7 @@ def _find_unseen_states(
     last = means[-1], covariances[-1]
     earlier = means[-1 - LAST], covariances[-1 - LAST]
     # Over one step first, which is cheap: hardly any recording ends so.
-    if not np.any(view.find_shown(*initial, 1) & ~view.find_shown(*last, 1)):
+    if not np.any(view.find_shown(*initial, steps=1) & ~view.find_shown(*last, steps=1)):
         return np.zeros(len(plant.states), dtype=bool)
     steps = len(plant.states)
     unseen = view.find_shown(*initial, steps) & ~view.find_shown(*last, steps) & ~view.find_shown(*earlier, steps)

@@ -174,7 +174,7 @@ def consistency(
     """
     entries = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
     rows = np.atleast_2d(entries)  # (runs, steps)
-    level = float(scalar("confidence", confidence, 0.0, 1.0))
+    level = float(scalar("confidence", confidence, low=0.0, high=1.0))
     if not 0 < level < 1:
         raise fail("confidence", "a number between 0 and 1", confidence)
     present = ~np.isnan(rows)

@@ -63,7 +63,7 @@ def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, 
 
 def check_run(run: int, runs: int | None) -> None:
     """Raise ValueError unless there is such a run; of a recording, which has none, any number will do."""
-    if runs is not None and check_count("run", run, 0) >= runs:
+    if runs is not None and check_count("run", run, least=0) >= runs:
         raise fail("run", f"one of {runs}, counted from 0", run)
 
 

@@ -135,7 +135,7 @@ class Record(SavableResults):
         Raises:
             ValueError: a recording, which has none, or a number that no run has.
         """
-        if self.runs is None or check_count("run", run, 0) >= self.runs:
+        if self.runs is None or check_count("run", run, least=0) >= self.runs:
             raise fail("run", "one of a Monte Carlo simulation" if self.runs is None else f"one of {self.runs}", run)
         measurements, estimates, reports = jax.tree.map(
             lambda leaf: np.asarray(leaf)[run], (self.measurements, self.estimates, self.reports)

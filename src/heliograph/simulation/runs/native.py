@@ -362,7 +362,7 @@ def _simulate_in_parts(
             if progress is not None:
                 progress((len(results) * total + done) // parts, total)
 
-        results.append(finish_result(reducer, started.complete(show_progress), part, None))
+        results.append(finish_result(reducer, started.complete(show_progress), part, smoothing=None))
 
     # Threads compute a part while the part before it is finished and the next one is made ready.
     running: tuple[NativeRuns, Network] | None = None

@@ -139,8 +139,8 @@ def start_channel(channel: Channel, key: jax.Array, source: Number, shared: Memo
 
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
     """
-    link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
-    keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
+    link, link_key = at(channel, k=0), draw_key(key, k=0, source=source, purpose=CHANNEL_START)
+    keys = [draw_key(key, k=0, source=memory, purpose=MEMORY_START) for memory in shared]
     state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
     past_signals = jnp.zeros(link.past * signal_size(link))
     return LateChannelState(state, past_signals) if link.past else state
@@ -149,7 +149,7 @@ def start_channel(channel: Channel, key: jax.Array, source: Number, shared: Memo
 def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
     """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
     numbered = zip(memories(models).values(), shared, strict=True)
-    return tuple(memory.begin(draw_key(key, 0, number, MEMORY_START)) for memory, number in numbered)
+    return tuple(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)) for memory, number in numbered)
 
 
 def move_modes(

@@ -70,7 +70,7 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
         received = apply(matrix, jnp.where(is_missing, 0.0, y_k))
         return state, jnp.where(lacks_input, jnp.nan, received)
 
-    start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
+    start = at(channel, k=0).init(draw_key(key, k=0, source=SENDER, purpose=CHANNEL_START))
     received: jax.Array
     _, received = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))
     return received
@@ -101,7 +101,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     results: list[Arrival] = []
     # Node by node; a value of step k - delay arrives at step k.
     for name, z in record.measurements.items():
-        values = z if z.ndim == 2 else z[check_count("run", run, 0)]
+        values = z if z.ndim == 2 else z[check_count("run", run, least=0)]
         values, delays = _separate_delays(name, network.nodes[name], values)
         arrived = ~np.isnan(values).all(axis=1) & ~np.isnan(delays)
         for k in np.flatnonzero(arrived):

@@ -46,7 +46,7 @@ class SlottedRelays(AbstractMedium):
 
     def init(self, key: jax.Array) -> RelayStates:
         """Return the initial mean as every relay's estimate, and the initial states of the hops with memory."""
-        mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
+        mean = jnp.asarray(at(self.relays.plant, k=0).initial_mean)
         hops = {
             name: start_channel(hop.channel, key, hop.source, self.memories[name])
             for name, hop in find_hops_with_memory(self.relays).items()
