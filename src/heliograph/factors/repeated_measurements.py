@@ -110,7 +110,8 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
         weighted = weights * row
         d = row @ weighted
         column = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
-        rows, size = rows - outer(column, row), size + outer(jnp.abs(column), jnp.abs(row))
+        rows = rows - outer(column, row)
+        size = size + outer(jnp.abs(column), jnp.abs(row))
         return rows, size, *insert_column(j, lower, column, variances, d)
 
     start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)

@@ -39,7 +39,8 @@ class FilterRecursion(Recursion):
         `begin`: number of the recording's first row; `output`: what is kept, a function of filter, state, innovation
         and row number.
         """
-        (z, u), number = row, self.begin + k
+        z, u = row
+        number = self.begin + k
         prior = self.filter.predict(state, u, number)
         after, innovation = self.filter.correct(prior, z, number)
         return after, self.output(self.filter, after, innovation, number)
@@ -89,7 +90,8 @@ def sum_rows(
 
         `before`: the state and the sums of outputs; `step`: returns state and output of a row.
         """
-        (state, sums), (data, k) = before, row
+        state, sums = before
+        data, k = row
         after, output = step(state, data, k)
         sums_after = jax.tree.map(jnp.add, sums, output)
         return select_state(k < count, (after, sums_after), before), None

@@ -108,7 +108,8 @@ class Judgement(NamedTuple):
         z: Float[Array, " m"], of_atoms: bool,
     ) -> "Judgement":  # fmt: skip
         """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
-        (prior, after), (expected, corrected) = states, estimates
+        prior, after = states
+        expected, corrected = estimates
         # A correction has no prediction: the state before it counts as before and after one.
         return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
 

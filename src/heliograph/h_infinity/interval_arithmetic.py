@@ -217,7 +217,8 @@ def _bound_quotient(a: Interval, b: Interval) -> Interval:
 
 def _bound_square(a: Interval) -> Interval:
     """Return the interval of x^2, from 0 where x may be 0; as x * x it would begin at low * high."""
-    low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
+    squares_of_ends = a.low**2, a.high**2
+    low, high = np.minimum(*squares_of_ends), np.maximum(*squares_of_ends)
     holds_zero = (a.low <= 0) & (a.high >= 0)
     square = round_outward(np.where(holds_zero, 0.0, low), high)
     return Interval(np.maximum(square.low, 0.0), square.high)

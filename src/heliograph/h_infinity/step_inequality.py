@@ -245,7 +245,8 @@ class UnknownsLayout(NamedTuple):
             Y = p2 @ self.gain
             return Unknowns(p1, p2, Y, self.gain.T @ Y, multipliers)
         after_weights = vector[2 * triangle :]
-        Y, triangle_of_z = after_weights[: n * m].reshape(n, m), after_weights[n * m : n * m + m * (m + 1) // 2]
+        Y = after_weights[: n * m].reshape(n, m)
+        triangle_of_z = after_weights[n * m : n * m + m * (m + 1) // 2]
         return Unknowns(p1, p2, Y, _mirror_lower_triangle(triangle_of_z, m), multipliers)
 
 

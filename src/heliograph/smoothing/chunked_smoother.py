@@ -169,7 +169,8 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
     for chunk in range(len(disagrees_with_next) - 1, -1, -1):
         if not disagrees_with_next[chunk]:
             continue
-        before, this, after = slice(chunk - 1, chunk), slice(chunk, chunk + 1), slice(chunk + 1, chunk + 2)
+        before, after = slice(chunk - 1, chunk), slice(chunk + 1, chunk + 2)
+        this = slice(chunk, chunk + 1)
         state = take(results.end, before) if chunk else take(states, this)
         replace_chunk(results, this, smooth(state, this, take(results.left, after)))
         if chunk:

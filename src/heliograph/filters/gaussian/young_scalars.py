@@ -85,7 +85,8 @@ def newton_step(t: jax.Array, f_of_t: jax.Array, slopes: Slopes) -> jax.Array:
     if len(residual) == 1:
         step = residual / (1 - slopes[0][0])
     else:  # I - J = [a b; c d], inverted by its adjugate [d -b; -c a]
-        (a, b), (c, d) = (1 - slopes[0][0], -slopes[0][1]), (-slopes[1][0], 1 - slopes[1][1])
+        a, b = 1 - slopes[0][0], -slopes[0][1]
+        c, d = -slopes[1][0], 1 - slopes[1][1]
         step = jnp.stack([d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]]) / (a * d - b * c)
     is_safe = jnp.all(jnp.abs(step) < LONGEST)
     return t + jnp.where(is_safe, step, residual)

@@ -77,7 +77,8 @@ class ScoreRecursion(Recursion):
             `now`: the estimate with its derivatives, and the information summed so far, of both halves of the
             recording.
             """
-            (estimate, information), (k, z, u) = now, row
+            estimate, information = now
+            k, z, u = row
             after, (density, score, information_of_row) = self.step(estimate, (z, u), k)
             return (after, information + information_of_row), (density, score)
 

@@ -128,7 +128,8 @@ def _predict_joint_moments(
         u: input of the step.
         transition: transition matrix of the modes (M, M).
     """
-    n, inputs, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
+    n, size = len(plant.states), moments.shape[-1]
+    inputs = jnp.asarray(u)
     # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0).
     matrix, noise = np.zeros((2, size, size))
     matrix[:n, :n], matrix[n, n] = plant.transition_matrix(inputs), 1.0

@@ -28,5 +28,6 @@ def orthogonalise_first_rows(
         variances.append(rows[i] @ weighted)
         # Only rows below row i change; a row without variance has no projection.
         multiples = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
-        rows, numbers = rows - outer(multiples, rows[i]), numbers - multiples * numbers[i]
+        rows = rows - outer(multiples, rows[i])
+        numbers = numbers - multiples * numbers[i]
     return rows, numbers, jnp.stack(variances)

@@ -217,7 +217,8 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, zeta the state times each mode's indicator, and columns of Cov v."""
-        channel, sensors, law = at(self.channel, k), list_mode_models(at(self.sensor, k)), state.law
+        channel, law = at(self.channel, k), state.law
+        sensors = list_mode_models(at(self.sensor, k))
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
         matrix, mean_output = subtract_mean_output(gains @ measure, law)

@@ -83,7 +83,8 @@ class UncertainModalFilter(AbstractJointModalFilter):
         Sigma-: covariance of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1). `young`: scalar of
         Young's inequality, by which the bound of the nominal part grows; `added_noise`: noise and the uncertain part.
         """
-        (transition, radius), x = self._chain_and_radius(state, k), state.gaussian
+        x = state.gaussian
+        transition, radius = self._chain_and_radius(state, k)
         matrix, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
         root, young, added_noise = self._transition_factors(state, u, k)
         deviation, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ transition
@@ -207,7 +208,8 @@ def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
     delta / root M: diag(delta) = P diag(delta) P + u d' + d u', and u d' + d u' <= e u u' + d d' / e by Young's
     inequality. P diag(delta) P is 0 for two modes. `low`, `high` (M,): ends of each mode's probability.
     """
-    modes, (middle, reach) = len(low), _find_middle_law(low, high)
+    modes = len(low)
+    middle, reach = _find_middle_law(low, high)
     projection, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
     e = total / modes / 2  # d d' <= diag(reach) sum reach / M, by Cauchy and Schwarz
     safe_e = jnp.where(e > 0, e, 1.0)

@@ -292,7 +292,8 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
 
     Source: prediction from the last filtered time; equal to augmenting the state with past signals.
     """
-    delayed_filter = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+    instance("filter", filter, AbstractFilter, "a filter")
+    delayed_filter = LateFilter(filter, check_count("delay", delay, least=0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
         return with_premise(delayed_filter, premise)

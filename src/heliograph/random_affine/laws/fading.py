@@ -98,7 +98,8 @@ def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
     else:
         previous, current, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
     while v < twice_order / 2:
-        previous, current, v = current, ((2 * v + 1 + x) * current - v * previous) / (v + 1), v + 1
+        next_value = ((2 * v + 1 + x) * current - v * previous) / (v + 1)
+        previous, current, v = current, next_value, v + 1
     moment: Scalar = current
     return moment
 

@@ -18,7 +18,8 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
 
     By centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1).
     """
-    (low1, high1), (low2, high2) = first, second
+    low1, high1 = first
+    low2, high2 = second
     c2, r2 = (high2 + low2) / 2, (high2 - low2) / 2
     c1, r1 = (high1 + low1) / 2, (high1 - low1) / 2
     absolute = library(c1, c2).abs

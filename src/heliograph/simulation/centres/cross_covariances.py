@@ -237,7 +237,8 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
 
         Covariances do not depend on data, so means are taken as 0.
         """
-        (states, centre_states), (k, u_k) = carry, row
+        states, centre_states = carry
+        k, u_k = row
         covariances: dict[str, jax.Array] = {}
         next_centre_states = []
         for centre, state in zip(filters.linear_centres, centre_states, strict=True):

@@ -128,7 +128,8 @@ class FusionCentre(Module):
             carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
             """Step the filters' states over step k, and the factors of the errors' covariance by their matrices."""
-            (states, factors), (k, u_k) = carry, row
+            states, factors = carry
+            k, u_k = row
             # Moments of the plant's state: row 0 of the means, and its part of the factors.
             covariance = jnp.asarray(factors.state @ factors.state.T)
             matrices = compute_matrices(states, u_k, k)
@@ -357,7 +358,8 @@ class CentreFilter(AbstractSizedFilter):
 
         The nodes' gains depend on no data, so that the centre computes them itself.
         """
-        (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
+        (centre,) = self.filters.linear_centres  # the one that fuses the reports
+        u, step = jnp.asarray(u), jnp.asarray(k)
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
         error_step = centre.step_errors(state.errors, filters, u, step)
         node_states = self.filters.step_without_data(state.nodes, u, step)

@@ -120,7 +120,8 @@ class NodeFilter(AbstractSizedFilter):
         message came, the mean is NaN, and the covariance any regular one: the node's own.
         """
         n, begin = len(self.states), self.measured[0]  # where the next neighbour's numbers begin in z
-        measurements, means, covariances = [z[:begin]], [before.mean[0]], [before.covariance[0]]
+        measurements = [z[:begin]]  # the node's own first
+        means, covariances = [before.mean[0]], [before.covariance[0]]
         # Of each neighbour mean (n), covariance (n n) and measurement (size).
         for size in self.measured[1:]:
             mean, covariance, measurement = jnp.split(z[begin : begin + n + n * n + size], [n, n + n * n])

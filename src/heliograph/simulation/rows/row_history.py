@@ -37,7 +37,8 @@ class RowHistory(NamedTuple):
         """
         inputs = self.held.shape[1]
         numbers = self.rows[row]
-        measurements, u, time = numbers[: -inputs - 1], numbers[-inputs - 1 : -1], numbers[-1]
+        measurements, u = numbers[: -inputs - 1], numbers[-inputs - 1 : -1]
+        time = numbers[-1]
         return measurements, u, time
 
     def state_after(self, row: jax.Array) -> PyTree:
@@ -47,7 +48,8 @@ class RowHistory(NamedTuple):
     def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
         """Return the inputs that led to a row: those held before it, with the time since then at place `dt`."""
         held_inputs = self.held[row - 1]
-        (_, _, time), (_, _, time_before) = self.read_row(row), self.read_row(row - 1)
+        _, _, time = self.read_row(row)
+        _, _, time_before = self.read_row(row - 1)
         return jnp.concatenate([held_inputs[:dt], (time - time_before)[None], held_inputs[dt:]])
 
     def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
