@@ -62,10 +62,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return JointMoments(mean, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return mixtures of the extreme weights with the extreme laws of each map: the law is linear in either.
-
-        So every law that is possible lies between these.
-        """
+        """Return the mixtures of each extreme law of the choice with each combination of the maps' extremes."""
         extreme_choices = [law for law in self.choice.extremes() if isinstance(law, Discrete)]  # all of them are
         return tuple(
             Mixture(extreme_maps, law.probabilities)
@@ -82,7 +79,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """
         corners_by_map = [affine.corner_moments(order) for affine in self.maps]
         weights = self.choice.corners()
-        corner_numbers = np.array(list(product(*(range(len(corners_of_map)) for corners_of_map in corners_by_map)))).T
+        numbers_by_map = [range(len(corners_of_map)) for corners_of_map in corners_by_map]
+        corner_numbers = np.array(list(product(*numbers_by_map))).T
         combined = stack_parts(
             [corners_of_map[numbers] for corners_of_map, numbers in zip(corners_by_map, corner_numbers, strict=True)]
         )

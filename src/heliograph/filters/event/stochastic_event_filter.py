@@ -262,7 +262,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         outputs.
         """
         assert isinstance(self.trigger, StochasticTrigger)
-        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
+        root = cholesky(self.trigger.matrix(self.outputs))
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
 
     def _condition_on_silence(

@@ -1,5 +1,7 @@
 """Random numbers of particles: resampling of weighted ones, their normal numbers, and keys that depend on the data."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +69,8 @@ def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, parti
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
     # The index of each word among those of all particles, which is folded into the key: two halves of 32 bits.
     positions = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
-    halves = jax.vmap(jax.vmap(lambda position: jax.random.fold_in(key, position)))(positions).astype(jnp.uint64)
+    fold_positions = jax.vmap(jax.vmap(partial(jax.random.fold_in, key)))  # over particles and words
+    halves = fold_positions(positions).astype(jnp.uint64)
     return halves[..., 0] << np.uint64(32) | halves[..., 1]
 
 

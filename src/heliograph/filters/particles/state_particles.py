@@ -110,7 +110,12 @@ class StateParticleFilter(AbstractStateParticleFilter):
         Each number has a random key of its own, so that one particle's draw does not depend on how many there are.
         """
         plant = at(self.plant, k=0)
-        drawn: jax.Array = jax.vmap(lambda number: plant.sample_initial(jax.random.fold_in(key, number)))(numbers)
+
+        def draw(number: jax.Array) -> jax.Array:
+            """Draw x_0 of the particle of this number."""
+            return plant.sample_initial(jax.random.fold_in(key, number))
+
+        drawn: jax.Array = jax.vmap(draw)(numbers)
         return drawn
 
     @predicts

@@ -116,10 +116,11 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
     }
     weighed_centrally = outcome["weighed_centrally"].items()
     central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}
-    return {
-        name: WeighingColumns(*(tuple(map(int, field)) for field in columns))
-        for name, columns in (columns_by_place | central).items()
-    }
+    weights = {}
+    for name, columns in (columns_by_place | central).items():
+        value, variance, weight = (tuple(map(int, field)) for field in columns)
+        weights[name] = WeighingColumns(value, variance, weight)
+    return weights
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:

@@ -91,7 +91,12 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
 def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
     """Return the leaves of `values` (or their shapes) on which some result of the function depends."""
     leaves, tree = jax.tree.flatten(values)
-    traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
+
+    def call_with_leaves(*leaves: PyTree) -> PyTree:
+        """Return the function's result for values of these leaves."""
+        return function(jax.tree.unflatten(tree, leaves))
+
+    traced = jax.make_jaxpr(call_with_leaves)(*leaves)
     # JAX's removal of dead code says which arguments are used.
     _, are_used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
     return [leaf for leaf, is_used in zip(leaves, are_used, strict=True) if is_used]

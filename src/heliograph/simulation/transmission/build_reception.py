@@ -49,12 +49,13 @@ def make_reception(network: Network) -> AbstractMedium:
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
     """Return the medium of a network's relays: how they send to each other in slots, one after another in a step."""
-    listeners = {name: i for i, name in enumerate(relays.filters)}
+    number_of_listener = {name: i for i, name in enumerate(relays.filters)}
+    listeners_by_group = [tuple(number_of_listener[name] for name in names) for names in network.groups]
     hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}
     return SlottedRelays(
         relays=relays,
         estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
-        groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
+        groups=tuple(listeners_by_group),
         memories=number_memory_seeds(hops),
     )
 
