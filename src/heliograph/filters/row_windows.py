@@ -48,25 +48,31 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array: a view, blocks of rows, or copied one by one.
-
-        Closed over: `begin`, first rows of the windows; `length` of each; `total` rows; `are_first_blocks`: windows are
-        the first rows in order; `are_blocks`: each is a block of rows that begins at a multiple of the length.
-        """
+        """Return the windows of one array of rows: views where these may be, else copies."""
         if are_first_blocks:
-            return leaf[: len(begin) * length].reshape(len(begin), length, *leaf.shape[1:])
-        if are_blocks:
-            blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
-            return np.asarray(blocks[begin // length])
-        windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
-        for window, first_row in zip(windows, begin, strict=True):
-            available = leaf[first_row : first_row + length]
-            window[: len(available)] = available
-            # Behind the end of the data the last row is repeated.
-            window[len(available) :] = leaf[-1]
-        return windows
+            return _split_into_blocks(leaf, length)[: len(begin)]
+        return _split_into_blocks(leaf, length)[begin // length] if are_blocks else _copy_windows(leaf, begin, length)
 
     return jax.tree.map(take_from, rows)
+
+
+def _split_into_blocks(leaf: np.ndarray, length: int) -> np.ndarray:
+    """Return rows in blocks of this length (blocks, length, ...), a view, without rows behind the last whole block."""
+    blocks = len(leaf) // length
+    return leaf[: blocks * length].reshape(blocks, length, *leaf.shape[1:])
+
+
+def _copy_windows(leaf: np.ndarray, begin: Int[np.ndarray, " n"], length: int) -> np.ndarray:
+    """Return a copy of each window of an array of rows (n, length, ...), the last row repeated behind the data's end.
+
+    `begin`: number of the first row of each window.
+    """
+    windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
+    for window, first_row in zip(windows, begin, strict=True):
+        available = leaf[first_row : first_row + length]
+        window[: len(available)] = available
+        window[len(available) :] = leaf[-1]
+    return windows
 
 
 def run_and_join(

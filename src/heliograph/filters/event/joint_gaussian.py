@@ -19,7 +19,7 @@ from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
-from heliograph.filters.gaussian.signal_moments import factor_gain_noise, find_signal_moments
+from heliograph.filters.gaussian.signal_moments import Signal, factor_gain_noise, find_signal_moments
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.linalg import outer
@@ -50,20 +50,21 @@ def augment_by_signal(
     x: the plant's state, r: the value that a sender compares with y. E[x_i^2] sets the size of numbers that rounding
     acts on.
     """
-    n = len(start)
 
     def augment_one(both: Gaussian) -> Gaussian:
-        """Return the Gaussian of (x, r, y) from that of (x, r): y = slopes (x, r) + noise, by the sensor and transform.
-
-        n: length of x; `start`: E[x_i^2] before any data, the size of numbers that rounding acts on.
-        """
-        signal = find_signal_moments(plant, sensor, transform, take_leading(both, n), start)
-        # y does not depend on r, the components behind x.
-        slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
-        noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-        return append_rows(both, signal.mean, slopes, noise)
+        """Return one Gaussian of (x, r, y) from that of (x, r)."""
+        signal = find_signal_moments(plant, sensor, transform, take_leading(both, len(start)), start)
+        return _append_signal(both, signal)
 
     return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
+
+
+def _append_signal(both: Gaussian, signal: Signal) -> Gaussian:
+    """Return the Gaussian of (x, r, y) from that of (x, r), `both`: y = slopes x + noise, whatever r is."""
+    length_of_r = len(both.mean) - signal.slopes.shape[1]
+    slopes = jnp.pad(signal.slopes, ((0, 0), (0, length_of_r)))
+    noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
+    return append_rows(both, signal.mean, slopes, noise)
 
 
 def predict_with_reference(
@@ -115,22 +116,28 @@ def condition_parts_on_received(
         m: length of y.
         delivers: what arrives is y itself, all of it or nothing, so that y is known afterwards.
     """
-    size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        """Return one Gaussian of (x, r, y) given z, and log of the density of z.
-
-        Closed over: z, the sender's measurement, of which `arrived` came; `link`, moments of z given y; `sender`, its
-        components of y (m,); `delivers`: z is y itself, the last m of the Gaussian's `size` components.
-        """
-        expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
-        after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
-        if delivers:  # y is z, to the last digit
-            after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
-        return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
+        """Return one Gaussian of (x, r, y) given z, and log of the density of z."""
+        return _condition_on_received(x, z, arrived, link, sender, m, delivers)
 
     after, density = jax.vmap(update_one)(parts.gaussian)
     return GaussianSum(parts.log_weight + density, after, parts.label)
+
+
+def _condition_on_received(
+    x: Gaussian, z: jax.Array, arrived: jax.Array, link: LinkMoments, sender: slice, m: int, delivers: bool
+) -> tuple[Gaussian, jax.Array]:
+    """Return one Gaussian x of (state, r, y) given z = G y + n, and log of the density of z.
+
+    Arguments as of `condition_parts_on_received`.
+    """
+    expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
+    after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
+    if delivers:  # y is z, to the last digit
+        size = len(x.mean)  # y are the last m components
+        after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
+    return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
 
 def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:

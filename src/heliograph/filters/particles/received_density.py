@@ -44,25 +44,10 @@ class ReceivedAtoms(Module):
 
         p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles`: components of z.
         """
-        present = ~jnp.isnan(z)
-        both_present = present[:, None] & present
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
-            """Return log N(z; gain y + offset, noise) of one atom (N,), `noise` a covariance; -inf where E z is NaN.
-
-            y (N, p): signals of N particles; `present` (m,): which components of z arrived, `both_present` (m, m): of
-            which pairs both did; `angles`: which are angles; LOG_TURN: log 2 pi.
-            """
-            # z - E z, 0 for what did not arrive and for an E z that is no number.
-            expected = y @ gain.T + offset
-            valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
-            value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
-            value = jnp.where(valid[:, None] & present, value, 0.0)
-            # Whitened by the factor of the noise; what did not arrive has variance 1.
-            factor = jnp.linalg.cholesky(jnp.where(both_present, noise, jnp.eye(len(z))))
-            whitened = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
-            log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
-            return jnp.where(valid, -(jnp.sum(whitened**2, axis=1) + log_determinant) / 2, -jnp.inf)
+            """Return log N(z; gain y + offset, noise) of one atom (N,)."""
+            return _log_density_of_atom(y @ gain.T + offset, noise, z, angles)
 
         # log of the weighted sum over the atoms.
         atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)
@@ -81,6 +66,23 @@ class ReceivedAtoms(Module):
         second = jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset)  # E[n n'] of each atom
         covariance = jnp.einsum("a,aij->ij", weight, second) - jnp.outer(mean, mean)
         return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, covariance
+
+
+def _log_density_of_atom(expected: jax.Array, noise: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
+    """Return log N(z; expected, noise) of the components of z (m,) that arrived, for each expectation (N, m).
+
+    `noise`: a covariance; `angles`: components of z; LOG_TURN: log 2 pi. -inf where what is expected is no number.
+    """
+    present = ~jnp.isnan(z)
+    # z - E z, 0 for what did not arrive and for an E z that is no number.
+    valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
+    value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
+    value = jnp.where(valid[:, None] & present, value, 0.0)
+    # Whitened by the factor of the noise; what did not arrive has variance 1.
+    factor = jnp.linalg.cholesky(jnp.where(present[:, None] & present, noise, jnp.eye(len(z))))
+    whitened = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
+    log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
+    return jnp.where(valid, -(jnp.sum(whitened**2, axis=1) + log_determinant) / 2, -jnp.inf)
 
 
 class ReceivedDensity(Module):

@@ -4,6 +4,7 @@ With L_i = P(received | word i sent), M = P(received) = E L(y) and t = (y - m)/s
 E[t L] and E[t^2 L]: E y = m + s E[t L]/M, Var y = s^2 (E[t^2 L]/M - (E[t L]/M)^2). The variance may be larger than s^2.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -223,6 +224,30 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
     return WordEffect(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
 
 
+def _sum_wide_words(
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> WordEffect:
+    """Return the effect of a word on y by a sum over the words within the prior's reach: 8.5 deviations of its mean.
+
+    Arguments are those of `find_effect_of_bits`.
+    """
+    return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
+
+
+def _sum_fine_words(
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> WordEffect:
+    """Return the effect of a word on y by a sum over cells of several words, and over what lies beyond the end words.
+
+    The dither's variance widens the prior, and is removed after. Arguments are those of `find_effect_of_bits`.
+    """
+    wider, variance_ratio = widen_by_dither(prior, grid, dither)
+    sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
+    # Each sum is the mean over the combinations of error rates.
+    mean_sums = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
+    return remove_dither(find_effect_from_sums(mean_sums), variance_ratio)
+
+
 def find_effect_of_bits(
     pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
 ) -> WordEffect:
@@ -244,24 +269,7 @@ def find_effect_of_bits(
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    def sum_wide_words() -> WordEffect:
-        """Return the effect on y by a sum over words within the prior's reach: 8.5 deviations of its mean.
-
-        Closed over: `pairs`, likelihoods of the bits for each combination of error rates, `weights` its probability;
-        `received`, the word that came; `grid`, the words; `prior` of y; the encoder's `dither`.
-        """
-        return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
-
-    def sum_fine_words() -> WordEffect:
-        """Return the effect on y by a sum over cells of several words, and over what lies beyond the end words.
-
-        Closed over as in `sum_wide_words`. The dither's variance widens the prior, and is removed after.
-        """
-        wider, variance_ratio = widen_by_dither(prior, grid, dither)
-        sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
-        # Each sum is the mean over the combinations of error rates.
-        mean_sums = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
-        return remove_dither(find_effect_from_sums(mean_sums), variance_ratio)
-
+    word = pairs, weights, received, grid, prior, dither
+    sum_wide_words, sum_fine_words = partial(_sum_wide_words, *word), partial(_sum_fine_words, *word)
     effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)
     return effect

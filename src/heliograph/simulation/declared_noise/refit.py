@@ -19,7 +19,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
     AbstractToldMap,
@@ -320,27 +320,38 @@ def _maximise_likelihood(
     if has_bias:
         time_step = find_median_step(declared)
         low[-1], high[-1] = np.log(FAST * time_step), np.log(SLOW * len(declared.z) * time_step)
-    likelihood = RefitLikelihood(declared)
-    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
-
-    def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
-        """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
-
-        `logs`: the free logarithms (where `free`), the others staying as in `start`; `low`, `high`: limits of all.
-        `moves`: a row for each free one, which moves it by DIFFERENCE. A likelihood that is NaN counts as -LOST nats.
-        """
-        all_logs = start.copy()
-        all_logs[free] = logs
-        points = np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)])
-        points = np.clip(points, low, high)  # flat beyond the limits
-        values = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
-        above, below = np.split(values[1:], 2)
-        return float(values[0]), (above - below) / (2 * DIFFERENCE)
-
+    fixed_arguments = RefitLikelihood(declared), start, free, (low, high)
     if not free.any():  # the only number is fixed: there is nothing to search
-        loss, _ = compute_loss(start[free])
+        loss, _ = _compute_loss(start[free], *fixed_arguments)
         return Refit(start, -loss)
-    found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
+    found = scipy.optimize.minimize(
+        _compute_loss, start[free], args=fixed_arguments, jac=True, method="BFGS", options={"gtol": SLOPE}
+    )
     logs = start.copy()
     logs[free] = found.x
     return Refit(np.clip(logs, low, high), -float(found.fun))
+
+
+def _compute_loss(
+    logs: Float[np.ndarray, " free"],
+    likelihood: RefitLikelihood,
+    start: Float[np.ndarray, " numbers"],
+    free: Bool[np.ndarray, " numbers"],
+    limits: tuple[Float[np.ndarray, " numbers"], Float[np.ndarray, " numbers"]],
+) -> tuple[float, Float[np.ndarray, " free"]]:
+    """Return minus the log-likelihood, and its slope by central differences; all points in one call.
+
+    Args:
+        logs: the free logarithms.
+        likelihood: of all logarithms; one that is NaN counts as -LOST nats.
+        start: all logarithms, of which those that are not free stay.
+        free: which are free.
+        limits: lowest and highest values of all, beyond which the likelihood is flat.
+    """
+    all_logs = start.copy()
+    all_logs[free] = logs
+    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
+    points = np.clip(np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)]), *limits)
+    losses = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
+    above, below = np.split(losses[1:], 2)
+    return float(losses[0]), (above - below) / (2 * DIFFERENCE)
