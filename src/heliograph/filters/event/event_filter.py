@@ -159,24 +159,24 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        parts, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
+        mixture, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
         log_likelihood, differences, covariances = jnp.zeros(()), [], []
         # Senders one after the other, each with its value or its silence, given the senders before it.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            augmented = augment_by_signal(plant, sensor, self.transform, parts, start)
+            augmented = augment_by_signal(plant, sensor, self.transform, mixture, start)
             arrived = jnp.any(~jnp.isnan(received))
             after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
             log_likelihood_of_sender = log_total_weight(after.log_weight)
             log_likelihood += log_likelihood_of_sender
-            parts = after.scale_weights(-log_likelihood_of_sender)
+            mixture = after.scale_weights(-log_likelihood_of_sender)
             # From now on the sender has a reference; where it is acknowledged, once a value arrived.
             begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
             differences.append(received - expected)
             covariances.append(spread)
         innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
-        return EventBelief.from_sum(parts, begun, state.moved), innovation
+        return EventBelief.from_sum(mixture, begun, state.moved), innovation
 
     def _condition_on_sender(
         self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -364,12 +364,12 @@ class EventFilter(AbstractSizedFilter):
             indices[n + sender.start : n + sender.stop] = np.arange(n + m + sender.start, n + m + sender.stop)
         return indices
 
-    def _restore_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
+    def _restore_if_impossible(self, mixture: GaussianSum, before: GaussianSum) -> GaussianSum:
         """Return the updated sum; where all its weights are 0, the sum `before` with FLOOR (1e-6) as likelihood."""
-        unchanged = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
+        unchanged = before.select_components(np.arange(mixture.gaussian.mean.shape[1]))
         unchanged = unchanged._replace(log_weight=unchanged.log_weight + np.log(FLOOR))
-        is_impossible = ~jnp.isfinite(log_total_weight(parts.log_weight))
-        restored: GaussianSum = jax.tree.map(lambda old, new: jnp.where(is_impossible, old, new), unchanged, parts)
+        is_impossible = ~jnp.isfinite(log_total_weight(mixture.log_weight))
+        restored: GaussianSum = jax.tree.map(lambda old, new: jnp.where(is_impossible, old, new), unchanged, mixture)
         return restored
 
     @estimates

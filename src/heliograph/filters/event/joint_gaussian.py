@@ -43,7 +43,7 @@ class LinkMoments(NamedTuple):
 
 
 def augment_by_signal(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
+    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, mixture: GaussianSum, start: jax.Array
 ) -> GaussianSum:
     """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data.
 
@@ -51,38 +51,38 @@ def augment_by_signal(
     acts on.
     """
 
-    def augment_one(both: Gaussian) -> Gaussian:
+    def augment_one(joint: Gaussian) -> Gaussian:
         """Return one Gaussian of (x, r, y) from that of (x, r)."""
-        signal = find_signal_moments(plant, sensor, transform, take_leading(both, len(start)), start)
-        return _append_signal(both, signal)
+        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(start)), start)
+        return _append_signal(joint, signal)
 
-    return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
+    return mixture._replace(gaussian=jax.vmap(augment_one)(mixture.gaussian))
 
 
-def _append_signal(both: Gaussian, signal: Signal) -> Gaussian:
-    """Return the Gaussian of (x, r, y) from that of (x, r), `both`: y = slopes x + noise, whatever r is."""
-    length_of_r = len(both.mean) - signal.slopes.shape[1]
+def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
+    """Return the Gaussian of (x, r, y) from that of (x, r), `joint`: y = slopes x + noise, whatever r is."""
+    length_of_r = len(joint.mean) - signal.slopes.shape[1]
     slopes = jnp.pad(signal.slopes, ((0, 0), (0, length_of_r)))
     noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-    return append_rows(both, signal.mean, slopes, noise)
+    return append_rows(joint, signal.mean, slopes, noise)
 
 
 def predict_with_reference(
-    plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data.
 
     r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
     """
     n = len(start)
-    length_of_r = len(both.mean) - n
-    image = find_transition_moments(plant, transform, take_leading(both, n), u)
+    length_of_r = len(joint.mean) - n
+    image = find_transition_moments(plant, transform, take_leading(joint, n), u)
     noise = sum_unexplained(image, factor_process_noise(plant, u, start))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
-    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), both.root[n:]])
-    noise_of_both = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
-    mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return from_columns(mean, join_columns(WeightedColumns(slopes, both.variances), noise_of_both))
+    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), joint.root[n:]])
+    noise_of_joint = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
+    mean = jnp.concatenate([image.mean + plant.noise_mean(), joint.mean[n:]])
+    return from_columns(mean, join_columns(WeightedColumns(slopes, joint.variances), noise_of_joint))
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
@@ -97,7 +97,7 @@ def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> 
 
 
 def condition_parts_on_received(
-    parts: GaussianSum,
+    mixture: GaussianSum,
     z: jax.Array,
     arrived: jax.Array,
     link: LinkMoments,
@@ -108,7 +108,7 @@ def condition_parts_on_received(
     """Return each Gaussian of (x, r, y) given z = G y + n, its weight multiplied by the density of z.
 
     Args:
-        parts: the sum over state x, reference r and signal y of the sender.
+        mixture: the sum over state x, reference r and signal y of the sender.
         z: what was received from the sender.
         arrived: which components of z arrived.
         link: moments of G and n.
@@ -121,8 +121,8 @@ def condition_parts_on_received(
         """Return one Gaussian of (x, r, y) given z, and log of the density of z."""
         return _condition_on_received(x, z, arrived, link, sender, m, delivers)
 
-    after, density = jax.vmap(update_one)(parts.gaussian)
-    return GaussianSum(parts.log_weight + density, after, parts.label)
+    after, density = jax.vmap(update_one)(mixture.gaussian)
+    return GaussianSum(mixture.log_weight + density, after, mixture.label)
 
 
 def _condition_on_received(
