@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.event_columns import count_missing_messages
-from heliograph.files.sources.node_reading import Reading
+from heliograph.files.sources.message_reading import Reading
 
 MOVING = hg.Plant(lambda x, u: x, lambda u: 0.1 * u[:1, None], [0.0], 1.0, states=["x"], inputs=["dt"])
 COUNTING = hg.LinearPlant([[1.0]], 0.1, [0.0], 1.0, states=["x"])

@@ -189,7 +189,7 @@ def test_inputs_hold_and_repeated_events_count_once(world):
     """Input 2 from second 1 on: the row at 1 has what held before it, the next has 2; time since the row before."""
     network, *_ = world
     table = hg.files.EventTable(network)
-    from heliograph.files.sources.node_reading import Reading
+    from heliograph.files.sources.message_reading import Reading
 
     second = 10**9
     for node, time, value in (("gps", 3, 7.0), ("inputs", 1, 2.0), ("gps", 0, 5.0), ("gps", 3, 7.0)):

@@ -49,8 +49,8 @@ class EngineChoice(NamedTuple):
         """Sentence "native: ..." with the number of operations, or "xla: ..." with `why` there is no native code."""
         if self.code is None:
             return f"xla: {self.why}"
-        slow = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
-        return f"native: {self.code.operations} operations{slow}"
+        divisions = f", {self.code.divisions} of them divisions and roots" if self.code.divisions else ""
+        return f"native: {self.code.operations} operations{divisions}"
 
     def results(self) -> PyTree:
         """Run the code on the arrays."""
@@ -72,7 +72,8 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """
     if not callable(function):
         raise fail("function of one run", "a function of arrays", show_value(function))
-    return choose_code(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments)).explanation
+    arrays = jax.tree.map(np.asarray, arguments)
+    return choose_code(function, arrays, differs_by_run=[True] * len(arguments)).explanation
 
 
 def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
@@ -83,11 +84,14 @@ def explain_refusal(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     if read_forced_engine() == "xla":
         return ""
     with jax.enable_x64(True):
-        return _find_compiled_code(function, arguments, [False] * len(arguments)).why
+        return _find_compiled_code(function, arguments, differs_by_run=[False] * len(arguments)).why
 
 
 def choose_code(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
+    function: Callable[..., PyTree],
+    arguments: Sequence[PyTree],
+    differs_by_run: Sequence[bool],
+    most: int | None = None,
 ) -> EngineChoice:
     """Return the native code of a function for arguments like these, compiled once; or why XLA has to compute it.
 
@@ -96,7 +100,7 @@ def choose_code(
     Args:
         function: a function of the arrays of one run.
         arguments: its arguments.
-        differs: for each argument, whether it has a leading axis of runs; the others are shared by all runs.
+        differs_by_run: for each argument, whether it has a leading axis of runs; the others are shared by all runs.
         most: operations above which XLA computes, unless native code is forced; no limit by default.
 
     Raises:
@@ -105,7 +109,7 @@ def choose_code(
     engine = read_forced_engine()
     if engine == "xla":
         return EngineChoice(code=None, why=f"{SETTING} is set to it")
-    choice = _find_compiled_code(function, arguments, differs, None if engine == "native" else most)
+    choice = _find_compiled_code(function, arguments, differs_by_run, None if engine == "native" else most)
     # LLVM may refuse what was lowered: only an attempt shows it.
     if choice.code is not None and (why := choice.code.generate_code(choice.arrays)):
         choice = EngineChoice(code=None, why=why)
@@ -126,7 +130,7 @@ def compute_once(
         most: operations above which XLA computes; no limit by default, so that XLA has only what native code refuses.
     """
     with jax.enable_x64(True):
-        choice = choose_code(function, arguments, [False] * len(arguments), most)
+        choice = choose_code(function, arguments, differs_by_run=[False] * len(arguments), most=most)
         if choice.code is None:
             return float64.to_numpy(by_xla(*arguments))
         # The code computes runs, here one. `[0, ...]` keeps arrays, where `[0]` would make NumPy's scalars.
@@ -161,7 +165,8 @@ def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
         if kwargs or is_traced(*args):
             return by_xla(*args, **kwargs)
         float64.refuse_forked_process()
-        returned: R = compute_once(function, by_xla, jax.tree.map(float64.as_array, args), SHORT)
+        arrays = jax.tree.map(float64.as_array, args)
+        returned: R = compute_once(function, by_xla, arrays, most=SHORT)
         return returned
 
     return call
@@ -210,20 +215,23 @@ def make_native_or_none(make: Callable[[], Code]) -> Code | None:
 
 
 def _find_compiled_code(
-    function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool], most: int | None = None
+    function: Callable[..., PyTree],
+    arguments: Sequence[PyTree],
+    differs_by_run: Sequence[bool],
+    most: int | None = None,
 ) -> EngineChoice:
     """Return the native code of a function for arguments of this structure, compiled once, or why there is none.
 
     Args:
         function: the function, which may be a tree with arrays itself, as a bound method of a filter is.
         arguments: trees with arrays.
-        differs: for each argument whether its arrays have a leading axis of runs.
+        differs_by_run: for each argument whether its arrays have a leading axis of runs.
         most: operations above which there is no code; the compiler's own limit if None.
     """
     leaves, structure = jax.tree.flatten((function, *arguments))
     # The same of each leaf; those of the function have no axis of runs.
     leaf_differs = [False] * len(jax.tree.leaves(function))
-    for argument, argument_differs in zip(arguments, differs, strict=True):
+    for argument, argument_differs in zip(arguments, differs_by_run, strict=True):
         leaf_differs += [argument_differs] * len(jax.tree.leaves(argument))
     # The key of the cache of code: the structure and its leaves, of arrays their shape in one run and their type.
     # Arrays become arguments of the code; all other leaves are part of it.
@@ -252,7 +260,7 @@ class _ArrayOfRun(NamedTuple):
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    differs: bool
+    differs_by_run: bool
 
 
 @lru_cache(COMPILED)
@@ -270,14 +278,14 @@ def _compile_for_structure(structure: Any, leaves: tuple[Any, ...], most: int | 
 
         The tree (`structure`) is (function, *arguments): also the function may hold arrays.
         """
-        items = iter(values)
-        with_values = [next(items) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
+        next_value = iter(values)
+        with_values = [next(next_value) if isinstance(leaf, _ArrayOfRun) else leaf for leaf in leaves]
         function, *arguments = jax.tree.unflatten(structure, with_values)
         return function(*arguments)
 
     placeholder: Any = jax.ShapeDtypeStruct
     examples = [placeholder(array.shape, array.dtype) for array in arrays]
-    shared = [n for n, array in enumerate(arrays) if not array.differs]  # numbers of the arguments that all runs share
+    shared = [n for n, array in enumerate(arrays) if not array.differs_by_run]
     try:
         return compile(call, *examples, shared=shared, most=most), ""
     except Unsupported as error:

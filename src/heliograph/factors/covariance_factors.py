@@ -65,7 +65,8 @@ def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
     """Return sum_i w_i P_i, w_i the `weights`: the columns of all P_i, (i, n, columns) in `parts`, side by side."""
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
-    return WeightedColumns(columns, (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1))
+    scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
+    return WeightedColumns(columns, scaled_weights)
 
 
 def zero_covariance(n: int) -> WeightedColumns:
@@ -75,21 +76,21 @@ def zero_covariance(n: int) -> WeightedColumns:
 
 def unit_lower(entries: Array) -> Any:
     """Build L (..., n, n) from its n (n - 1) / 2 entries below the diagonal, row by row: ones on it, zeros above."""
-    # With a 0 and a 1 behind them, each number of L is one of the entries: `place` (n, n) says which.
-    xp, place = library(entries), _place_unit_lower(entries.shape[-1])
-    ends = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
-    whole = xp.concatenate([entries, ends], axis=-1)
-    return whole[..., place] if xp is np else _take_entries(whole, place)
+    # With a 0 and a 1 behind them, each number of L is one of the entries, `index` (n, n) says which.
+    xp, index = library(entries), _place_unit_lower(entries.shape[-1])
+    zero_and_one = np.broadcast_to(np.array([0.0, 1.0], np.dtype(entries.dtype)), (*entries.shape[:-1], 2))
+    numbers = xp.concatenate([entries, zero_and_one], axis=-1)
+    return numbers[..., index] if xp is np else _take_entries(numbers, index)
 
 
 @cache_arrays
 def _place_unit_lower(count: int) -> np.ndarray:
     """Return which entry below the diagonal each number of L (n, n) is, by index; `count`: a 0, `count` + 1: a 1."""
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2  # of count = n (n - 1) / 2
-    place = np.full((n, n), count)
-    place[np.tril_indices(n, -1)] = np.arange(count)
-    np.fill_diagonal(place, count + 1)
-    return place
+    index = np.full((n, n), count)
+    index[np.tril_indices(n, -1)] = np.arange(count)
+    np.fill_diagonal(index, count + 1)
+    return index
 
 
 def below_diagonal(lower: jax.Array) -> jax.Array:
@@ -154,11 +155,10 @@ def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
         weighted = scale(weights, row)
         variances.append(lax.dot(row, weighted))
         # Column j of L: how much of row j is in each row below it, which is taken off there.
-        share = column_below_diagonal(
-            j, outer(lax.dot(rows, weighted), lax.reshape(reciprocal_or_one(variances[j]), (1,)))
-        )
-        rows = rows - outer(share, row)
-        lower.append(share)
+        reciprocal = lax.reshape(reciprocal_or_one(variances[j]), (1,))
+        column = column_below_diagonal(j, outer(lax.dot(rows, weighted), reciprocal))
+        rows = rows - outer(column, row)
+        lower.append(column)
     return assemble_factors(lower, variances, rows.dtype)
 
 
@@ -201,19 +201,21 @@ def eliminate(covariance: jax.Array, least: float = 0.0) -> WeightedColumns:
 
     Rounding may leave less than nothing of a pivot d_j, so each is raised to at least `least` times |P_jj|.
     """
-    pivots = least * lax.abs(diagonal(covariance))
-    return (_eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column)(covariance, pivots)
+    least_pivots = least * lax.abs(diagonal(covariance))
+    factor = _eliminate_by_loop if len(covariance) > WRITTEN else _eliminate_column_by_column
+    return factor(covariance, least_pivots)
 
 
 def _eliminate_column_by_column(covariance: jax.Array, least: jax.Array) -> WeightedColumns:
-    """Return L and d with L diag(d) L' = P, by elimination without square roots; no d_j is below `least` (n,)."""
-    n, rest, lower, variances = len(covariance), covariance, [], []
+    """Return L and d with L diag(d) L' = P, by elimination without square roots, no d below `least` (n,)."""
+    n, remainder, lower, variances = len(covariance), covariance, [], []
     for j in range(n):
-        column = lax.index_in_dim(rest, j, axis=1, keepdims=False)
+        column = lax.index_in_dim(remainder, j, axis=1, keepdims=False)
         variances.append(_bound_below(column[j], least[j]))
-        share = column_below_diagonal(j, outer(column, lax.reshape(reciprocal_or_zero(variances[j]), (1,))))
-        rest = symmetric(rest - outer(share, column))
-        lower.append(share)
+        reciprocal = lax.reshape(reciprocal_or_zero(variances[j]), (1,))
+        multiples = column_below_diagonal(j, outer(column, reciprocal))  # column j of L
+        remainder = symmetric(remainder - outer(multiples, column))
+        lower.append(multiples)
     return assemble_factors(lower, variances, covariance.dtype)
 
 
@@ -222,11 +224,11 @@ def decorrelate(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
     Of z = rows x + n with Cov n = L diag(d) L' these are the rows of L^-1 z, of uncorrelated noises.
     """
-    solved: list[jax.Array] = []
+    solved_rows: list[jax.Array] = []
     for i in range(len(rows)):
-        known = jnp.stack(solved) if solved else jnp.zeros((0, rows.shape[1]))
-        solved.append(rows[i] - lower[i, :i] @ known)
-    return jnp.stack(solved) if solved else rows
+        rows_above = jnp.stack(solved_rows) if solved_rows else jnp.zeros((0, rows.shape[1]))
+        solved_rows.append(rows[i] - lower[i, :i] @ rows_above)
+    return jnp.stack(solved_rows) if solved_rows else rows
 
 
 def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
@@ -237,17 +239,17 @@ def find_covariance_root(covariance: np.ndarray) -> np.ndarray:
     Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix (1990).
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    scale = np.where(deviation > 0, deviation, 1.0)
-    rest, columns = covariance / np.outer(scale, scale), []
+    unit = np.where(deviation > 0, deviation, 1.0)
+    remainder, columns = covariance / np.outer(unit, unit), []
     for _ in range(len(covariance)):
-        j = int(np.argmax(np.diagonal(rest)))
-        if rest[j, j] <= RANK:
+        j = int(np.argmax(np.diagonal(remainder)))
+        if remainder[j, j] <= RANK:
             break
-        columns.append(rest[:, j] / np.sqrt(rest[j, j]))
-        rest = rest - np.outer(columns[-1], columns[-1])
-        rest[j] = rest[:, j] = 0.0
+        columns.append(remainder[:, j] / np.sqrt(remainder[j, j]))
+        remainder = remainder - np.outer(columns[-1], columns[-1])
+        remainder[j] = remainder[:, j] = 0.0
     root = np.array(columns).T.reshape(len(covariance), -1)
-    return scale[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
+    return unit[:, None] * np.where(np.abs(root) > RANK, root, 0.0)
 
 
 def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -282,12 +284,12 @@ def factor_covariances(covariances: Array) -> WeightedColumns:
         eliminated: WeightedColumns = jax.vmap(eliminate)(covariances)
         return eliminated
     n = covariances.shape[-1]
-    each = list(covariances.reshape(-1, n, n))
+    all_covariances = list(covariances.reshape(-1, n, n))
     # Most steps of a long horizon have the same covariance, which is factored once.
-    different = {covariance.tobytes(): covariance for covariance in each}
-    roots = {numbers: find_covariance_root(covariance) for numbers, covariance in different.items()}
+    distinct = {covariance.tobytes(): covariance for covariance in all_covariances}
+    roots = {numbers: find_covariance_root(covariance) for numbers, covariance in distinct.items()}
     padded = {numbers: np.pad(root, ((0, 0), (0, n - root.shape[1]))) for numbers, root in roots.items()}
-    matrices = [padded[covariance.tobytes()] for covariance in each]
+    matrices = [padded[covariance.tobytes()] for covariance in all_covariances]
     return WeightedColumns(np.reshape(matrices, covariances.shape), np.ones(covariances.shape[:-1]))
 
 
@@ -346,10 +348,9 @@ def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: 
     n = len(variances)
     if not n:
         return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
-    below = lax.concatenate([lax.expand_dims(column, (1,)) for column in lower], 1)
-    return WeightedColumns(
-        below + np.eye(n, dtype=dtype), lax.concatenate([lax.reshape(d, (1,)) for d in variances], 0)
-    )
+    below = lax.concatenate([lax.expand_dims(column, (1,)) for column in lower], dimension=1)
+    d = lax.concatenate([lax.reshape(variance, (1,)) for variance in variances], dimension=0)
+    return WeightedColumns(below + np.eye(n, dtype=dtype), d)
 
 
 @operation(_triangularise_row_by_row)
@@ -366,8 +367,8 @@ def _triangularise_by_loop(columns: WeightedColumns) -> WeightedColumns:
         rows, lower, variances = carry
         weighted = weights * rows[j]
         d = rows[j] @ weighted
-        share = jnp.where(np.arange(n) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
-        return rows - jnp.outer(share, rows[j]), *insert_column(j, lower, share, variances, d)
+        multiples = jnp.where(np.arange(n) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        return rows - jnp.outer(multiples, rows[j]), *insert_column(j, lower, multiples, variances, d)
 
     start = rows, jnp.eye(n, dtype=rows.dtype), jnp.zeros(n, rows.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
@@ -381,10 +382,10 @@ def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColum
 
     def body(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         """Take column j off what is left of P, and put it into L and its pivot into d, which is at least `least[j]`."""
-        rest, lower, variances = carry
-        d = _bound_below(rest[j, j], least[j])
-        share = jnp.where(np.arange(n) > j, rest[:, j] * reciprocal_or_zero(d), 0.0)
-        return rest - jnp.outer(share, rest[j]), *insert_column(j, lower, share, variances, d)
+        remainder, lower, variances = carry
+        d = _bound_below(remainder[j, j], least[j])
+        multiples = jnp.where(np.arange(n) > j, remainder[:, j] * reciprocal_or_zero(d), 0.0)
+        return remainder - jnp.outer(multiples, remainder[j]), *insert_column(j, lower, multiples, variances, d)
 
     start = covariance, jnp.eye(n, dtype=covariance.dtype), jnp.zeros(n, covariance.dtype)
     _, lower, variances = lax.fori_loop(0, n, body, start)
@@ -392,8 +393,8 @@ def _eliminate_by_loop(covariance: jax.Array, least: jax.Array) -> WeightedColum
 
 
 def insert_column(
-    j: jax.Array, lower: jax.Array, share: jax.Array, variances: jax.Array, d: jax.Array
+    j: jax.Array, lower: jax.Array, column: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return L with `share` in column j, below its diagonal, and `variances` with d in entry j; a loop counts j."""
-    here = np.arange(len(variances)) == j
-    return jnp.where(here, lower + share[:, None], lower), jnp.where(here, d, variances)
+    """Return L with `column` as its column j, below the diagonal, and `variances` with d in entry j."""
+    is_j = np.arange(len(variances)) == j
+    return jnp.where(is_j, lower + column[:, None], lower), jnp.where(is_j, d, variances)

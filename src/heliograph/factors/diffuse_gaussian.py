@@ -61,13 +61,13 @@ def mark_unknown(covariance: jax.Array, unknown: jax.Array) -> jax.Array:
 
 
 def project_diffuse(x: Diffuse, matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the covariance of H x (m, m) by the known directions of x, and which components hear an unknown one (m,).
+    """Return the covariance of H x (m, m) by the known directions of x, and which components depend on unknown ones.
 
-    Unknown is a direction of infinite variance: a component that has a part of one has an infinite variance too.
+    An unknown direction has infinite variance: such a component (of m) has an infinite variance too.
     """
     slopes = _find_slopes(matrix, x)
-    unknown = jnp.any((slopes != 0) & (x.infinite > 0), axis=1)
-    return (slopes * x.variances) @ slopes.T, unknown
+    depends_on_unknown = jnp.any((slopes != 0) & (x.infinite > 0), axis=1)
+    return (slopes * x.variances) @ slopes.T, depends_on_unknown
 
 
 def _find_slopes(matrix: jax.Array, x: Diffuse) -> jax.Array:
@@ -130,10 +130,9 @@ def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) 
     n = len(mean)
     # Unit columns with an infinite weight where unknown, then those of what is known, with finite weights.
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
-    weights = FiniteAndInfiniteWeights(
-        jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)]),
-        jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])]),
-    )
+    finite = jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)])
+    infinite = jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])])
+    weights = FiniteAndInfiniteWeights(finite, infinite)
     lower, levels, _ = triangularise_both_levels(rows, weights, n)
     return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
 
@@ -157,13 +156,13 @@ def _append_noise_columns(
     noise, of finite weights. N diag(weights) N' is the noise's covariance.
     """
     rows = jnp.concatenate([slopes, jnp.asarray(noise.matrix)], axis=1)
-    own = jnp.asarray(noise.weights)
-    return rows, FiniteAndInfiniteWeights(
-        jnp.concatenate([x.variances, own]), jnp.concatenate([x.infinite, jnp.zeros(len(own))])
-    )
+    noise_weights = jnp.asarray(noise.weights)
+    finite = jnp.concatenate([x.variances, noise_weights])
+    infinite = jnp.concatenate([x.infinite, jnp.zeros(len(noise_weights))])
+    return rows, FiniteAndInfiniteWeights(finite, infinite)
 
 
-class DiffuseLikelihood(NamedTuple):
+class MeasurementLikelihood(NamedTuple):
     """What a measurement's components said: log-likelihood (), and which heard an unknown direction (m,)."""
 
     log_likelihood: jax.Array
@@ -172,7 +171,7 @@ class DiffuseLikelihood(NamedTuple):
 
 def observe_diffuse(
     x: Diffuse, matrix: jax.Array, innovation: jax.Array, noise: WeightedColumns
-) -> tuple[Diffuse, DiffuseLikelihood]:
+) -> tuple[Diffuse, MeasurementLikelihood]:
     """Condition x on z = H x + v; return it and what z says of the model.
 
     A component that shows an unknown direction adds -1/2 log s_inf to the log-likelihood, the others log N: their sum
@@ -200,7 +199,7 @@ def observe_diffuse(
         log = jnp.where(shows, -jnp.log(s) / 2, -(e**2 / s + jnp.log(s) + LOG_TURN) / 2)
         density = density + jnp.where(present[i], log, 0.0)
         shows_unknown.append(shows & present[i])
-    return state._replace(mean=x.mean + shift), DiffuseLikelihood(density, jnp.stack(shows_unknown))
+    return state._replace(mean=x.mean + shift), MeasurementLikelihood(density, jnp.stack(shows_unknown))
 
 
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
@@ -266,11 +265,11 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     n = len(x.mean)
-    moved, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
-    own = jnp.concatenate([x.root, jnp.zeros((n, moved.shape[1] - n))], axis=1)
-    lower, _, rest = triangularise_both_levels(jnp.concatenate([moved, own]), weights, n)
-    left, levels, _ = triangularise_both_levels(rest[n:], weights, n, own**2 @ weights.infinite)
-    law = Gaussian(x.mean, below_diagonal(left), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
+    next_rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
+    rows = jnp.concatenate([x.root, jnp.zeros((n, next_rows.shape[1] - n))], axis=1)
+    lower, _, remainder = triangularise_both_levels(jnp.concatenate([next_rows, rows]), weights, n)
+    conditional, levels, _ = triangularise_both_levels(remainder[n:], weights, n, rows**2 @ weights.infinite)
+    law = Gaussian(x.mean, below_diagonal(conditional), jnp.where(levels.infinite > 0, jnp.nan, levels.finite))
     return BackwardGain(law, lower[n:], ahead, below_diagonal(lower[:n]))
 
 

@@ -71,7 +71,7 @@ class Gaussian(NamedTuple):
     def covariance(self) -> Any:
         """L diag(d) L' (..., n, n), NumPy's or JAX's as the factors are; the upper triangle mirrored: symmetric."""
         xp = library(self)
-        root, variances = (xp.asarray(part) for part in (self.root, self.variances))
+        root, variances = (xp.asarray(factor) for factor in (self.root, self.variances))
         product = (root * variances[..., None, :]) @ xp.swapaxes(root, -1, -2)
         upper = np.triu(np.ones(product.shape[-2:], bool))
         return xp.where(upper, product, xp.swapaxes(product, -1, -2))
@@ -85,10 +85,10 @@ def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
 
 def from_summed_covariance(mean: jax.Array, *parts: WeightedColumns) -> Gaussian:
     """Return the Gaussian of the summed covariances, by elimination: faster than orthogonal rows, less exact."""
-    total = parts[0].covariance
-    for part in parts[1:]:
-        total = total + part.covariance
-    return from_covariance_by_elimination(mean, total)
+    covariance = parts[0].covariance
+    for columns in parts[1:]:
+        covariance = covariance + columns.covariance
+    return from_covariance_by_elimination(mean, covariance)
 
 
 def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
@@ -114,9 +114,8 @@ def predict_affine(x: Gaussian, matrix: Any, shift: Array, noise: WeightedColumn
 
     x has the mean m and covariance L diag(d) L'; F is `matrix`, b the `shift`, `noise` columns of Cov w.
     """
-    return from_columns(
-        jnp.asarray(matrix @ x.mean + shift), join_columns(WeightedColumns(matrix @ x.root, x.variances), noise)
-    )
+    of_state = WeightedColumns(matrix @ x.root, x.variances)
+    return from_columns(jnp.asarray(matrix @ x.mean + shift), join_columns(of_state, noise))
 
 
 class Image(NamedTuple):
@@ -156,7 +155,8 @@ def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Weighted
     x = m + L xi, with uncorrelated xi of variances d.
     `noise` holds the factors N diag(r) N' of Cov v. Shapes: mean (m,), slopes (m, n), noise (m, m).
     """
-    root = jnp.concatenate([jnp.pad(x.root, ((0, 0), (0, len(mean)))), jnp.concatenate([slopes, noise.matrix], axis=1)])
+    top = jnp.pad(x.root, ((0, 0), (0, len(mean))))
+    root = jnp.concatenate([top, jnp.concatenate([slopes, noise.matrix], axis=1)])
     variances = jnp.concatenate([x.variances, noise.weights])
     return Gaussian(jnp.concatenate([x.mean, mean]), below_diagonal(root), variances)
 
@@ -202,17 +202,18 @@ class Innovations(NamedTuple):
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
         """Return log N of what arrived: sum_j -(e_j^2 / s_j + log 2 pi s_j) / 2.
 
-        A component that those before it determine, s_j = 0 to rounding, adds nothing where it agrees with them and
-        -inf where it does not; `size` (m,) is the size of the terms whose difference is the innovation. `present` (m,)
-        says what arrived, e and s are the innovations and their variances, each given those before it.
+        e (`value`) are the innovations and s (`variance`) their variances, each given those before it; `present` (m,)
+        says what arrived. A component that those before it determine, s_j = 0 to rounding, adds nothing where it
+        agrees with them and -inf where it does not; `size` (m,) is the size of the terms whose difference is the
+        innovation.
         """
         determined = self.determined
-        safe = jnp.where(determined, 1.0, self.variance)
-        density = -(self.value**2 * (1 / safe) + jnp.log(safe) + LOG_TURN) / 2
+        variance = jnp.where(determined, 1.0, self.variance)
+        density = -(self.value**2 * (1 / variance) + jnp.log(variance) + LOG_TURN) / 2
         # It agrees up to rounding: shares of its deviation by itself (`whole` is the variance), and of the terms.
-        reach = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
-        agrees = jnp.where(lax.abs(self.value) <= reach, 0.0, -jnp.inf)
-        return jnp.sum(jnp.where(present, jnp.where(determined, agrees, density), 0.0))
+        tolerance = OFF_SUPPORT * jnp.sqrt(self.whole) + OFF_VALUE * size
+        log_agreement = jnp.where(lax.abs(self.value) <= tolerance, 0.0, -jnp.inf)
+        return jnp.sum(jnp.where(present, jnp.where(determined, log_agreement, density), 0.0))
 
 
 def condition_on_observation(
@@ -256,7 +257,8 @@ def gain_of(x: Gaussian, slopes: jax.Array, noise: WeightedColumns) -> jax.Array
 
         `root` has the components' rows below the n of the state, and so has the gain.
         """
-        return update_by_row(root, d, root[n + i], weights[i], rounding)[:3]
+        root, d, gain, _ = update_by_row(root, d, root[n + i], weights[i], rounding)
+        return root, d, gain
 
     *_, gains = update_by_parts(measure_part, jnp.concatenate([x.root, rows]), x.variances, least)
     entering = unit_lower(below_diagonal(gains[n:]))
@@ -270,8 +272,8 @@ def correct_by_gain(
 
     e is the innovation. Joseph's form, a sum of squares; with Kalman's gain it is `condition_on_observation`.
     """
-    left = WeightedColumns(x.root - gain @ slopes, x.variances)
-    return from_columns(x.mean + gain @ innovation, join_columns(left, noise.through(gain)))
+    error = WeightedColumns(x.root - gain @ slopes, x.variances)
+    return from_columns(x.mean + gain @ innovation, join_columns(error, noise.through(gain)))
 
 
 def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
@@ -292,10 +294,10 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
     """
     product = x.variances * row
     power = row * product
-    before = jnp.append(0.0, lax.cumsum(power))
-    s = ratio * before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
-    root, variances, w = update_root_columns(x.root, x.variances, product, (1 - ratio) * row, s)
-    return Gaussian(x.mean + w * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
+    sums_before = jnp.append(0.0, lax.cumsum(power))
+    s = ratio * sums_before + jnp.append(lax.cumsum(power, reverse=True), 0.0)
+    root, variances, gain_times_variance = update_root_columns(x.root, x.variances, product, (1 - ratio) * row, s)
+    return Gaussian(x.mean + gain_times_variance * (reciprocal_or_one(s[0]) * shift), below_diagonal(root), variances)
 
 
 def moments_of_mixture(
@@ -303,13 +305,13 @@ def moments_of_mixture(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
 
-    Means are taken about the first one, so that of equal means, however large, the differences are exactly 0 and no
-    rounding is squared.
+    Means are taken about the first one: of equal means, however large, the differences are exactly 0.
     """
-    about = means - means[0]
-    shift = weights @ about
+    about_first = means - means[0]
+    shift = weights @ about_first
     within = jnp.reshape(weights @ covariances.reshape(len(weights), -1), covariances.shape[1:])
-    return means[0] + shift, symmetric(within + WeightedColumns((about - shift).T, weights).covariance)
+    between = WeightedColumns((about_first - shift).T, weights).covariance
+    return means[0] + shift, symmetric(within + between)
 
 
 def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
@@ -394,5 +396,5 @@ def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
 
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
-    carried = WeightedColumns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
-    return from_columns(back.mean_given(later.mean), join_columns(carried, back.left.columns))
+    of_next_state = WeightedColumns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
+    return from_columns(back.mean_given(later.mean), join_columns(of_next_state, back.left.columns))

@@ -24,7 +24,8 @@ def settle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:
     reset = manifold.reset_jacobian(x.mean - center) if manifold.rotations else None
     if reset is None:
         return x
-    return from_columns(manifold.settle(center, x.mean), WeightedColumns(reset @ x.root, x.variances))
+    mean = manifold.settle(center, x.mean)
+    return from_columns(mean, WeightedColumns(reset @ x.root, x.variances))
 
 
 def unsettle(manifold: Manifold, center: jax.Array, x: Gaussian) -> Gaussian:

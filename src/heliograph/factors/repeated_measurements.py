@@ -35,7 +35,8 @@ def triangularise_noise(noise: WeightedColumns) -> WeightedColumns:
     if len(noise.matrix) < 3:
         return triangularise(noise)
     matrix, weights = jnp.asarray(noise.matrix), jnp.asarray(noise.weights)
-    return (_triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row)(matrix, weights)
+    factor = _triangularise_in_loop if len(matrix) > WRITTEN else _triangularise_row_by_row
+    return factor(matrix, weights)
 
 
 def rounding_of_products(n: int, variance: jax.Array) -> jax.Array:
@@ -51,7 +52,8 @@ def rounding_of_slopes(n: int, lower: jax.Array, whole: jax.Array) -> jax.Array:
     `whole` holds the variances (m,) of the rows s_i. It is ROUNDING_UNITS n eps of each s_i, from which measuring takes
     what was known, and RANK of what is subtracted: a correlation of noises is not known to more.
     """
-    share, below = max(ROUNDING_UNITS * n * unit_of(whole), RANK), jnp.tril(lower, -1)
+    share = max(ROUNDING_UNITS * n * unit_of(whole), RANK)
+    below = jnp.tril(lower, -1)
     return rounding_of_products(n, whole) + share**2 * (below**2 @ whole)
 
 
@@ -107,9 +109,10 @@ def _triangularise_in_loop(rows: jax.Array, weights: jax.Array) -> WeightedColum
         row = _set_rounding_to_zero(rows[j], share * size[j])
         weighted = weights * row
         d = row @ weighted
-        below = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
-        rows, size = rows - outer(below, row), size + outer(jnp.abs(below), jnp.abs(row))
-        return rows, size, *insert_column(j, lower, below, variances, d)
+        column = jnp.where(np.arange(m) > j, rows @ weighted * reciprocal_or_one(d), 0.0)
+        rows = rows - outer(column, row)
+        size = size + outer(jnp.abs(column), jnp.abs(row))
+        return rows, size, *insert_column(j, lower, column, variances, d)
 
     start = rows, jnp.abs(rows), jnp.eye(m, dtype=rows.dtype), jnp.zeros(m, rows.dtype)
     _, _, lower, variances = lax.fori_loop(0, m, eliminate_row, start)

@@ -41,9 +41,10 @@ def update_by_scalar_given_products(
     """
     product, power = products
     # s_j = Var v + sum_{k >= j} f_k^2 d_k, down to the variance of the noise alone; s_0 is that of the innovation.
-    s = lax.rev(lax.cumsum(lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], 0)), (0,))
-    after, kept, w = update_root_columns(root, d, product, f, s)
-    return after, kept, w * reciprocal_or_one(s[0]), s[0]
+    from_last = lax.concatenate([lax.reshape(noise, (1,)), lax.rev(power, (0,))], dimension=0)
+    s = lax.rev(lax.cumsum(from_last), (0,))
+    root_after, variances_after, w = update_root_columns(root, d, product, f, s)
+    return root_after, variances_after, w * reciprocal_or_one(s[0]), s[0]
 
 
 def update_root_columns(
@@ -128,10 +129,10 @@ def update_by_row(
     power = f * product
     if least is None:
         return update_by_scalar_given_products(root, d, f, (product, power), noise)
-    nothing = jnp.sum(power) <= least
-    beside = jnp.where(nothing, noise + noise_beside_rounding(len(d), least), noise)
-    root, d, gain, total = update_by_scalar_given_products(root, d, f, (product, power), beside)
-    return root, d, gain, jnp.where(nothing, noise, total)
+    is_rounding = jnp.sum(power) <= least
+    noise_or_large = jnp.where(is_rounding, noise + noise_beside_rounding(len(d), least), noise)
+    root, d, gain, variance = update_by_scalar_given_products(root, d, f, (product, power), noise_or_large)
+    return root, d, gain, jnp.where(is_rounding, noise, variance)
 
 
 Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
@@ -163,14 +164,14 @@ def _update_by_rows_one_by_one(
     `news` is the mean and, below it, the innovations times -1; `least` the variance up to which a row's slopes count as
     rounding, which none does of the first, whose slopes nothing was taken off.
     """
-    n, values, totals = len(d), list[jax.Array](), list[jax.Array]()
+    n, innovations, variances = len(d), list[jax.Array](), list[jax.Array]()
     for i in range(len(variance)):
         root, d, gain, total = update_by_row(root, d, root[n + i], variance[i], least[i] if i else None)
-        values.append(-news[n + i])
-        totals.append(total)
-        news = news + gain * values[i]
+        innovations.append(-news[n + i])
+        variances.append(total)
+        news = news + gain * innovations[i]
         least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
-    return root, d, news, _stack_numbers(values), _stack_numbers(totals)
+    return root, d, news, _stack_numbers(innovations), _stack_numbers(variances)
 
 
 def _update_by_rows_in_loop(
@@ -196,7 +197,7 @@ def _update_by_rows_in_loop(
         rounding = jnp.where(least[0] < 0, rounding_of_products(n, variance_of_row), least[0])
         least = propagate_slope_rounding(least, gain[n:], rounding)
         news = news + gain * innovation
-        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, 0)
+        carry = _move_row_to_end(rows, n), d, _move_row_to_end(news, n), _move_row_to_end(least, i=0)
         return carry, (innovation, variance_of_row)
 
     # -1 is below every variance: before the first row nothing was rounded.

@@ -30,14 +30,15 @@ def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "
     """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
 
     So units do not matter. Where rounding made an eigenvalue negative, it counts as zero; a component of variance zero
-    (`known` is False in its row and column) has a row of zeros.
+    (`is_known` is False in its row and column) has a row of zeros.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     unit = np.where(deviation > 0, deviation, 1.0)
     scale = unit[..., :, None] * unit[..., None, :]
-    known = deviation[..., :, None] * deviation[..., None, :] > 0
-    values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0) / scale)
-    return np.asarray(unit[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    is_known = deviation[..., :, None] * deviation[..., None, :] > 0
+    values, vectors = np.linalg.eigh(np.where(is_known, covariance, 0.0) / scale)
+    root_values = np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(unit[..., :, None] * vectors * root_values[..., None, :])
 
 
 def observe_root(
@@ -116,11 +117,11 @@ def _find_independent_rows(rows: Float[np.ndarray, "*items m c"]) -> Bool[np.nda
     These are the rows (..., m, c) of whose squared length more than the share RANK is left, when their part along those
     before is taken off.
     """
-    rest, adds = rows, np.zeros(rows.shape[:-1], bool)
+    remainder, is_independent = rows, np.zeros(rows.shape[:-1], bool)
     for j in range(rows.shape[-2]):
-        square = np.sum(rest[..., j, :] ** 2, axis=-1)
-        adds[..., j] = square > RANK * np.sum(rows[..., j, :] ** 2, axis=-1)
-        length = np.where(adds[..., j], np.sqrt(square), np.inf)
-        unit = rest[..., j, :] / length[..., None]
-        rest = rest - (rest @ unit[..., None]) @ unit[..., None, :]
-    return adds
+        square = np.sum(remainder[..., j, :] ** 2, axis=-1)
+        is_independent[..., j] = square > RANK * np.sum(rows[..., j, :] ** 2, axis=-1)
+        length = np.where(is_independent[..., j], np.sqrt(square), np.inf)
+        unit = remainder[..., j, :] / length[..., None]
+        remainder = remainder - (remainder @ unit[..., None]) @ unit[..., None, :]
+    return is_independent

@@ -49,7 +49,7 @@ from .recording import (
     read_recording as read_recording,
     write_recording as write_recording,
 )
-from .sources.node_reading import (
+from .sources.message_reading import (
     Reading as Reading,
 )
 from .stores.store_tables import (

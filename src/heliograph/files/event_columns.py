@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.files.sources.node_reading import Unread
+from heliograph.files.sources.message_reading import Unread
 from heliograph.live.event import VERDICTS, Verdict
 from heliograph.live.link_counts import GAP
 from heliograph.model.checks.refusal_reasons import Reason, RefusedError

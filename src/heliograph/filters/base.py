@@ -392,8 +392,8 @@ def check_step_number(filter: AbstractFilter, k: Step) -> Step:
     """Return k as the number of a step that the filter covers."""
     if isinstance(k, jax.core.Tracer):
         return k  # inside a compiled computation it has no value to check
-    is_one = isinstance(k, int | np.integer | np.ndarray | jax.Array) and not np.shape(k)
-    if not is_one or np.asarray(k).dtype.kind not in "iu" or np.asarray(k) < 0:
+    is_scalar = isinstance(k, int | np.integer | np.ndarray | jax.Array) and not np.shape(k)
+    if not is_scalar or not np.issubdtype(np.asarray(k).dtype, np.integer) or np.asarray(k) < 0:
         raise fail("step", "a whole number from 0", show_value(k))
     if filter.horizon is not None and np.asarray(k) >= filter.horizon:
         raise fail("step", f"one of the {filter.horizon} that the filter covers, counted from 0", k)

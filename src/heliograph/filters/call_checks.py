@@ -42,9 +42,9 @@ def call_with_inputs(filter: Any, state: PyTree, function: Callable[..., R], *da
     """
     if not filter.inputs or is_traced(filter, state, *data):
         return call_with_state(filter, state, function, *data)
-    result, spoilt = call_with_state(filter, state, _wrap_with_input_test(function), *data)
-    u, k = data[-2:]
-    if spoilt:
+    result, is_invalid = call_with_state(filter, state, _wrap_with_input_test(function), *data)
+    *_, u, k = data
+    if is_invalid:
         check_inputs(filter.inputs, np.asarray(u)[None], filter, int(k))
     return cast(R, result)
 
@@ -59,8 +59,9 @@ def _wrap_with_input_test(function: Callable[..., R]) -> Callable[..., tuple[R, 
 
     @compile_on_call
     def call(filter: Any, state: PyTree, *data: PyTree) -> tuple[R, Array]:
-        """Call the function, and test the inputs u at step k."""
-        return function(filter, state, *data), do_inputs_spoil(filter, filter.inputs, *data[-2:])
+        """Return the function's result, and whether the input u makes the plant's functions at step k invalid."""
+        *_, u, k = data
+        return function(filter, state, *data), do_inputs_spoil(filter, filter.inputs, u, k)
 
     return call
 

@@ -113,9 +113,8 @@ def sum_filtered_in_chunks(filter: Any, z: Array, u: Array, output: Callable[...
     start = initial_state_if_linear(filter) if is_long(len(z)) else None
     if start is None:
         return None
-    whole = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
-    # The outputs are sums of each chunk (chunks, ...).
-    return None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
+    by_chunk = sum_in_chunks(FilterRecursion(filter, output), start, (np.asarray(z), np.asarray(u)))
+    return None if by_chunk is None else jax.tree.map(lambda sums: sums.sum(axis=0), by_chunk.outputs)
 
 
 def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
@@ -124,13 +123,13 @@ def scan_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanRes
     Return the last state and what is kept of each row. `start`: the state before the first row.
     """
     with jax.enable_x64(True):
-        whole = _scan_all_chunks(recursion, start, rows, OF_ROWS)
-    if whole is None:
+        by_chunk = _scan_all_chunks(recursion, start, rows, OF_ROWS)
+    if by_chunk is None:
         return None
     # Chunks (chunks, rows, ...) one after the other, without the rows that fill up the last one.
     total = len(jax.tree.leaves(rows)[0])
-    joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], whole.outputs)
-    return ScanResult(whole.last, joined)
+    joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], by_chunk.outputs)
+    return ScanResult(by_chunk.last, joined)
 
 
 def sum_in_chunks(recursion: Recursion, start: PyTree, rows: PyTree) -> ScanResult | None:
@@ -215,7 +214,7 @@ class WarmUpRun(NamedTuple):
             return self._filter_windows(states, windows, first)
         # Complete windows begin settled, and stay so; the others are filtered in full.
         arguments = self.recursion, self.settled, means_of(states), windows, first
-        choice = choose_code(means_after_settled_rows, arguments, [False, False, True, True, True])
+        choice = choose_code(means_after_settled_rows, arguments, differs_by_run=[False, False, True, True, True])
         if choice.code is None:
             return None
         results = self.settled.repeat_with_means(choice.results())
@@ -230,16 +229,16 @@ class WarmUpRun(NamedTuple):
 
         `first`: number of each window's first row. None without native code.
         """
-        # Flags: the recursion is the same for all windows, the other three arguments differ.
-        choice = choose_code(state_after_rows, (self.recursion, states, windows, first), [False, True, True, True])
+        arguments = self.recursion, states, windows, first
+        choice = choose_code(state_after_rows, arguments, differs_by_run=[False, True, True, True])
         return None if choice.code is None else choice.results()
 
 
 def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray, " chunks"]) -> PyTree | None:
-    """Return the state with which each chunk begins (chunks, ...); None where probes do not agree on theirs.
+    """Return the state with which each chunk begins (chunks, ...); None if the filter forgets its start too late.
 
-    What a state holds beside its Gaussians, moments before any data, may never forget: then it is computed of all rows.
-    `first` has the first rows of all chunks but the first one.
+    Each is computed from any start some rows before, forgotten by then. Moments before any data may never be forgotten:
+    they are then computed of all rows. `first`: first rows of all chunks but the first.
     """
     starts = repeat_state(start, len(jax.tree.leaves(warm_up.rows)[0]) // warm_up.ahead)  # one each `ahead` rows
     forgets = _start_is_forgotten(warm_up, starts, first)
@@ -249,8 +248,8 @@ def _find_start_states(warm_up: WarmUpRun, start: PyTree, first: Int[np.ndarray,
         forgets = starts is not None and _start_is_forgotten(warm_up, starts, first)
     if not forgets:
         return None
-    reached = warm_up.states_before(first, starts)
-    return jax.tree.map(lambda one, others: np.concatenate([one[None], others]), start, reached)
+    later = warm_up.states_before(first, starts)
+    return jax.tree.map(lambda at_first, at_later: np.concatenate([at_first[None], at_later]), start, later)
 
 
 def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarray, " chunks"]) -> bool | None:
@@ -261,29 +260,32 @@ def _start_is_forgotten(warm_up: WarmUpRun, starts: PyTree, first: Int[np.ndarra
     for every `ahead` rows; `first`: first rows of chunks.
     """
     probes = first[:: -(-len(first) // PROBES)]  # the stride is rounded up
-    once, early = (warm_up.states_before(rows, starts) for rows in (probes, probes - warm_up.ahead))
-    if once is None:
+    from_nearer = warm_up.states_before(probes, starts)
+    if from_nearer is None:
         return None
-    twice = warm_up.states_before(probes, early, one_start_each=True)
-    among = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), twice)
-    return bool(np.mean(find_equal_states(once, twice, among=among)) > 0.5)
+    earlier = warm_up.states_before(probes - warm_up.ahead, starts)
+    from_farther = warm_up.states_before(probes, earlier, one_start_each=True)
+    scale_states = jax.tree.map(lambda *leaves: np.concatenate(leaves), take(starts, slice(0, 1)), from_farther)
+    return bool(np.mean(find_equal_states(from_nearer, from_farther, among=scale_states)) > 0.5)
 
 
 def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, ahead: int) -> PyTree | None:
-    """Return start states, one each `ahead` rows, whose parts that depend on no data are computed up to there."""
-    # BLOCKS blocks of `ahead` rows at a time.
-    parts, state, size = list[PyTree](), start, BLOCKS * ahead
-    for begin in range(0, len(jax.tree.leaves(rows)[0]), size):
+    """Return start states, one each `ahead` rows, whose parts that no data change (not Gaussians) are of those rows."""
+    # Predict over BLOCKS blocks of `ahead` rows at a time.
+    parts_by_block, state, rows_at_once = list[PyTree](), start, BLOCKS * ahead
+    for begin in range(0, len(jax.tree.leaves(rows)[0]), rows_at_once):
         blocks = jax.tree.map(lambda leaf: leaf.reshape(BLOCKS, ahead, *leaf.shape[2:]),
-                              take_windows(rows, np.array([begin]), size))  # fmt: skip
-        choice = choose_code(_predict_data_free_parts, (recursion, state, blocks, np.asarray(begin)), [False] * 4)
+                              take_windows(rows, np.array([begin]), rows_at_once))  # fmt: skip
+        choice = choose_code(
+            _predict_data_free_parts, (recursion, state, blocks, np.asarray(begin)), differs_by_run=[False] * 4
+        )
         if choice.code is None:
             return None
         last, before = jax.tree.map(lambda leaf: leaf[0, ...], choice.results())
         state = with_gaussians(last, start)
-        parts.append(before)
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return with_gaussians(joined, repeat_state(start, BLOCKS * len(parts)))
+        parts_by_block.append(before)
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts_by_block)
+    return with_gaussians(joined, repeat_state(start, BLOCKS * len(parts_by_block)))
 
 
 class ChunkPrograms(NamedTuple):
@@ -318,23 +320,24 @@ def _scan_all_chunks(recursion: Recursion, start: PyTree, rows: PyTree, programs
     # below say which arguments of a program differ from chunk to chunk.
 
     def scan(states: PyTree, which: Which) -> PyTree:
-        """Return the results of the chunks `which`, filtered in full from these states."""
-        # rows: all data; total: their number; length: rows of a chunk; begun.first: the first row of each chunk.
-        parts = [
-            (recursion, take(states, part), windows, first, total)
-            for part, first, windows in take_windows_in_parts(rows, begun.first[which], length)
+        """Return the results of the chunks `which`, filtered in full by `programs.full` from the states `states`.
+
+        Closed over: `recursion` steps the filter; `total` rows of data; chunks of `length` rows begin at `begun.first`.
+        """
+        calls = [
+            (recursion, take(states, batch), windows, first, total)
+            for batch, first, windows in take_windows_in_parts(rows, begun.first[which], length)
         ]
-        return run_and_join(programs.full, parts, [False, True, True, True, False])
+        return run_and_join(programs.full, calls, differs_by_run=[False, True, True, True, False])
 
     def scan_means(settled: SettledState) -> PyTree:
-        """Return the results of all chunks, with the covariances and gains of the settled state: only means differ."""
+        """Return the results of all chunks by covariances and gains of `settled`: only means differ. Else as `scan`."""
         means = means_of(begun.states)
-        # rows: all data; total: their number; length: rows of a chunk; begun: state and first row of each chunk.
-        parts = [
-            (recursion, settled, take(means, part), windows, first, total)
-            for part, first, windows in take_windows_in_parts(rows, begun.first, length)
+        calls = [
+            (recursion, settled, take(means, batch), windows, first, total)
+            for batch, first, windows in take_windows_in_parts(rows, begun.first, length)
         ]
-        joined = run_and_join(programs.settled, parts, [False, False, True, True, True, False])
+        joined = run_and_join(programs.settled, calls, differs_by_run=[False, False, True, True, True, False])
         return None if joined is None else (settled.repeat_with_means(joined[0]), programs.complete(settled, joined[1]))
 
     results = scan_means_where_settled(begun, scan, scan_means)
@@ -363,8 +366,8 @@ def scan_means_where_settled(
     results = None if settled is None else scan_means(settled)
     if results is None:
         return scan_in_full(begun.states, slice(None))
-    if len(others := np.flatnonzero(~begun.covered)):
-        replace_chunk(results, others, scan_in_full(take(begun.states, others), others))
+    if len(unsettled_chunks := np.flatnonzero(~begun.covered)):
+        replace_chunk(results, unsettled_chunks, scan_in_full(take(begun.states, unsettled_chunks), unsettled_chunks))
     return results
 
 

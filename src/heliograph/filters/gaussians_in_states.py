@@ -61,18 +61,21 @@ def _deviations(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_largest_slopes(states: PyTree) -> Iterator[float]:
-    """Yield for each derivative in the states (n, ...) its largest entry, in standard deviations of its Gaussian.
+    """Yield for each derivative of a Gaussian in the states (n, ...) its largest entry, in deviations of the Gaussian.
 
-    A state's moving parts are Gaussians, each followed by the derivatives of its mean and covariance.
+    What data change in a state are Gaussians, each followed by the derivatives of its mean and covariance.
     """
     for part in _moving_parts(states):
         if isinstance(part, Gaussian):
             gaussian = part
             continue
-        units = _deviations(np.asarray(gaussian.covariance))
+        deviations = _deviations(np.asarray(gaussian.covariance))
         with np.errstate(invalid="ignore", divide="ignore"):
-            shares = [np.where(unit > 0, np.abs(slope) / unit, 0.0) for slope, unit in zip(part, units, strict=True)]
-        yield max(float(np.max(share, initial=0.0, where=np.isfinite(share))) for share in shares)
+            scaled_slopes = [
+                np.where(deviation > 0, np.abs(slope) / deviation, 0.0)
+                for slope, deviation in zip(part, deviations, strict=True)
+            ]
+            yield max(float(np.max(slope, initial=0.0, where=np.isfinite(slope))) for slope in scaled_slopes)
 
 
 def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, "..."]:
@@ -103,11 +106,13 @@ def means_of(state: PyTree) -> list[Any]:
 
 def with_means(state: PyTree, means: Sequence[Any]) -> PyTree:
     """Return a state whose Gaussians, and their derivatives, have other means."""
-    # A part moves if its mean depends on data: a Gaussian, or a derivative of one.
     next_mean = iter(means)
-    return jax.tree.map(
-        lambda part: part._replace(mean=next(next_mean)) if _is_moving(part) else part, state, is_leaf=_is_moving
-    )
+
+    def replace_mean(part: PyTree) -> PyTree:
+        """Return a Gaussian, or a derivative of one, with the next of `means`; any other part as it is."""
+        return part._replace(mean=next(next_mean)) if _is_moving(part) else part
+
+    return jax.tree.map(replace_mean, state, is_leaf=_is_moving)
 
 
 def beside_gaussians(state: PyTree) -> PyTree:
@@ -116,13 +121,12 @@ def beside_gaussians(state: PyTree) -> PyTree:
 
 
 def with_gaussians(beside: PyTree, state: PyTree) -> PyTree:
-    """Return a state with its Gaussians and their derivatives, and with `beside` in place of the rest.
+    """Return `state` with its Gaussians and their derivatives as they are, and `beside` in place of all other parts.
 
-    `beside` is what `beside_gaussians` returns.
+    `beside` is what `beside_gaussians` returns of a state.
     """
-    # A part moves if it is a Gaussian or a derivative of one.
-    parts = iter(_leaves_beside(beside))
-    return jax.tree.map(lambda part: part if _is_moving(part) else next(parts), state, is_leaf=_is_moving)
+    other_parts = iter(_leaves_beside(beside))
+    return jax.tree.map(lambda part: part if _is_moving(part) else next(other_parts), state, is_leaf=_is_moving)
 
 
 def _moving_parts(state: PyTree) -> list[Any]:

@@ -25,10 +25,10 @@ def gaussian_innovation(
         covariance: the innovation covariance (m, m).
     """
     present = ~jnp.isnan(z)
-    value, both = jnp.asarray(z - expected), present[:, None] & present
-    # The sizes of both terms of the difference say how large its rounding is.
-    likelihood = log_density(value, jnp.asarray(covariance), jnp.abs(z) + jnp.abs(expected))
-    return Innovation(value, jnp.where(both, covariance, jnp.nan), likelihood)
+    value, both_present = jnp.asarray(z - expected), present[:, None] & present
+    size = jnp.abs(z) + jnp.abs(expected)  # of both terms of the difference, for its rounding
+    log_likelihood = log_density(value, jnp.asarray(covariance), size)
+    return Innovation(value, jnp.where(both_present, covariance, jnp.nan), log_likelihood)
 
 
 def no_innovation() -> Innovation:
@@ -83,16 +83,19 @@ def posterior_weights(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return posterior weights p_a N(z; ...) of a mixture, log-likelihood of z, and whether all components exclude z.
 
-    `likelihood`: log N(z; ...) of each component, -inf where it excludes z. Where all do, the weights stay as they are.
-
-    `weight`: prior probabilities p_a of the components.
+    `weight`: prior probabilities p_a of the components; `likelihood`: log N(z; ...) of each, -inf where it excludes
+    z. Where all do, the weights stay as they are.
     """
     # log p_a N(z; ...), and -inf of a component that is impossible, whatever it says.
-    possible = jnp.asarray(weight) > 0
-    prior = jnp.where(possible, jnp.log(jnp.where(possible, weight, 1.0)), -jnp.inf)
-    weighed = jnp.where(possible, likelihood, 0.0) + prior
-    excluded = jnp.max(weighed) == -jnp.inf
-    return jax.nn.softmax(jnp.where(excluded, prior, weighed)), jax.nn.logsumexp(weighed), excluded
+    is_possible = jnp.asarray(weight) > 0
+    log_prior = jnp.where(is_possible, jnp.log(jnp.where(is_possible, weight, 1.0)), -jnp.inf)
+    log_posterior = jnp.where(is_possible, likelihood, 0.0) + log_prior
+    all_excluded = jnp.max(log_posterior) == -jnp.inf
+    return (
+        jax.nn.softmax(jnp.where(all_excluded, log_prior, log_posterior)),
+        jax.nn.logsumexp(log_posterior),
+        all_excluded,
+    )
 
 
 @readable
@@ -104,16 +107,15 @@ class Weighed(NamedTuple):
     weight: Array
 
     def summarise(self) -> "tuple[InnovationSummary, ...]":
-        """Return a summary over time for each output, one after the other.
+        """Return a summary over time for each output, one after the other: shares and medians with 95 % intervals.
 
-        Intervals count N values that are correlated over time as N (1 - a) / (1 + a), a the correlation of neighbours:
-        of the share Wilson's, with a of being down-weighted or not, since outliers come in runs behind a moving mean;
-        of the median the quantiles 1/2 -+ 1.96 / (2 sqrt N), with a of the innovations by ranks, which outliers do not
-        hide.
+        N values correlated over time count as N (1 - a) / (1 + a) independent ones, a the correlation of neighbours.
+        For the share of down-weighted values (Wilson's interval) a is that of being down-weighted, since outliers
+        come in runs; for the median (quantiles 1/2 -+ 1.96 / (2 sqrt N)) that of the innovations' ranks, which
+        outliers do not hide.
         """
-        return tuple(
-            _summarise_output(*columns) for columns in zip(*(np.asarray(column).T for column in self), strict=True)
-        )
+        fields_by_output = [np.asarray(field).T for field in self]
+        return tuple(_summarise_output(*of_output) for of_output in zip(*fields_by_output, strict=True))
 
     def square_used(self) -> Float[np.ndarray, "time m"]:
         """Return the squares over their variances of those that count at least half, NaN for the others."""
@@ -159,10 +161,10 @@ class InnovationSummary(NamedTuple):
         if not self.received:
             return f"received 0 of {self.expected}"
         share = f"({100 * self.share.low:.2g} % to {100 * self.share.high:.2g} %)"
-        # `half`: half width of the 95 % interval; round to as many digits as the standard error has, half / 1.96.
-        half = (self.bias_high - self.bias_low) / 2
-        bias, error = (round_to(number, half / NORMAL) for number in (self.bias, half))
-        return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {bias} +- {error}"
+        # Of the 95 % interval; numbers are rounded to as many digits as the standard error, half_width / 1.96, has.
+        half_width = (self.bias_high - self.bias_low) / 2
+        shown_bias, shown_half_width = (round_to(number, half_width / NORMAL) for number in (self.bias, half_width))
+        return f"{self.down_weighted} of {self.received} down-weighted {share}, bias {shown_bias} +- {shown_half_width}"
 
     def describe_left_out(self, filter: str, output: str) -> list[str]:
         """Return a line of warning where a filter left out most values of an output, which outliers are not.
@@ -180,12 +182,10 @@ class InnovationSummary(NamedTuple):
     def find_outlying(summaries: "Sequence[InnovationSummary]") -> list[int]:
         """Return the numbers of outputs of which more values are down-weighted than of the others together.
 
-        By an interval of the difference of both shares.
+        Shares p with Wilson's 95 % intervals (l, u), of one output (1) and of the others together (2): p_1 - p_2 is
+        above 0 by more than sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
 
-        Shares p with intervals (l, u), of one output and of the others together: p_1 - p_2 is above 0 by more than
-        sqrt((p_1 - l_1)^2 + (u_2 - p_2)^2). Of outputs that are alike some 3 of 100 are named.
-
-        `independent`: how many independent values would have the same interval; `wilson`: Wilson's interval of a share.
+        `independent`: how many independent values would have the same interval.
 
         Args:
             summaries: one of each output.
@@ -198,10 +198,10 @@ class InnovationSummary(NamedTuple):
             if not summary.received or not others:
                 continue
             pooled = sum(other.down_weighted for other in others) / sum(other.received for other in others)
-            independent = sum(other.independent for other in others)
-            rest = wilson(pooled * independent, independent)
+            independent_count = sum(other.independent for other in others)
+            interval_of_others = wilson(pooled * independent_count, independent_count)
             share = summary.share
-            if share.estimate - pooled > np.hypot(share.estimate - share.low, rest.high - pooled):
+            if share.estimate - pooled > np.hypot(share.estimate - share.low, interval_of_others.high - pooled):
                 outliers.append(i)
         return outliers
 

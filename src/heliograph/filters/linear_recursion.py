@@ -34,13 +34,15 @@ class FilterRecursion(Recursion):
     begin: Array = eqx.field(default_factory=lambda: np.asarray(0))
 
     def step(self, state: PyTree, row: tuple[Array, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Predict and correct; return the state after the row, and what is kept of the row.
+        """Predict and correct with the data of row k; return the state after it, and what is kept of it.
 
-        `begin`: number of the recording's first row; `output`: what is kept, a function of filter, state, innovation,
-        number.
+        `begin`: number of the recording's first row; `output`: what is kept, a function of filter, state, innovation
+        and row number.
         """
-        (z, u), number = row, self.begin + k
-        after, innovation = self.filter.correct(self.filter.predict(state, u, number), z, number)
+        z, u = row
+        number = self.begin + k
+        prior = self.filter.predict(state, u, number)
+        after, innovation = self.filter.correct(prior, z, number)
         return after, self.output(self.filter, after, innovation, number)
 
 
@@ -83,14 +85,16 @@ def sum_rows(
     `count`: number of the row at which the data end; from it on nothing changes.
     """
 
-    def body(now: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
-        """Step over one row and add its output; from row `count` on nothing changes.
+    def body(before: tuple[PyTree, PyTree], row: tuple[PyTree, Array]) -> tuple[tuple[PyTree, PyTree], None]:
+        """Step over one row and add its output to the sums; from row `count` on nothing changes.
 
-        `now`: the state and the sums of outputs; `step`: returns state and output of a row.
+        `before`: the state and the sums of outputs; `step`: returns state and output of a row.
         """
-        (state, sums), (data, k) = now, row
+        state, sums = before
+        data, k = row
         after, output = step(state, data, k)
-        return select_state(k < count, (after, jax.tree.map(jnp.add, sums, output)), now), None
+        sums_after = jax.tree.map(jnp.add, sums, output)
+        return select_state(k < count, (after, sums_after), before), None
 
     numbers = make_row_numbers(rows, first)
     shapes = jax.eval_shape(lambda: step(state, jax.tree.map(lambda leaf: leaf[0], rows), numbers[0])[1])
@@ -102,10 +106,12 @@ def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: A
     """Return the state after some rows, of which the first has the number `first`, and nothing of the rows."""
 
     def step(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
-        """Step over one row."""
-        return recursion.step(state, *row)[0], None
+        """Return the state after one row (data, number), and nothing that is kept of it."""
+        after, _ = recursion.step(state, *row)
+        return after, None
 
-    return jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))[0]
+    last_state, _ = jax.lax.scan(step, jax.tree.map(jnp.asarray, state), (rows, make_row_numbers(rows, first)))
+    return last_state
 
 
 def make_row_numbers(rows: PyTree, first: Array) -> Array:

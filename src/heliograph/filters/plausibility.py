@@ -78,18 +78,29 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def judge_prediction(
-        claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], spoilt: Array
+        claim: Claim, states: tuple[PyTree, PyTree], estimates: tuple[Estimate, Estimate], are_inputs_invalid: Array
     ) -> "Judgement":
         """Judge a prediction by itself, as a step without data; arguments as of `judge_step`.
 
-        `states`, `estimates`: before and after the prediction. `spoilt`: whether its inputs were no numbers.
-
-        `claim`: "none" if the filter claims no covariance.
+        `states`, `estimates`: before and after the prediction. `are_inputs_invalid`: whether it had no numbers as
+        inputs. `claim`: "none" if the filter claims no covariance.
         """
         (before, prior), (estimate_before, prediction), no_data = states, estimates, jnp.zeros(0)
-        empty = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
-        three = estimate_before, prediction, prediction  # before, after prediction, after a correction by nothing
-        return judge_step(claim, (before, prior, prior), three, empty, no_data, of_atoms=False, spoilt=spoilt)
+        no_innovation = Innovation(no_data, jnp.zeros((0, 0)), jnp.zeros(()))
+        three_estimates = (
+            estimate_before,
+            prediction,
+            prediction,
+        )  # before, after prediction, after a correction by nothing
+        return judge_step(
+            claim,
+            (before, prior, prior),
+            three_estimates,
+            no_innovation,
+            no_data,
+            of_atoms=False,
+            spoilt=are_inputs_invalid,
+        )
 
     @staticmethod
     def judge_correction(
@@ -97,7 +108,8 @@ class Judgement(NamedTuple):
         z: Float[Array, " m"], of_atoms: bool,
     ) -> "Judgement":  # fmt: skip
         """Judge a correction by itself, from states and estimates before and after it; arguments as of `judge_step`."""
-        (prior, after), (expected, corrected) = states, estimates
+        prior, after = states
+        expected, corrected = estimates
         # A correction has no prediction: the state before it counts as before and after one.
         return judge_step(claim, (prior, prior, after), (expected, expected, corrected), innovation, z, of_atoms)
 
@@ -111,18 +123,17 @@ class Judgement(NamedTuple):
     def find_culprit(
         candidates: "Sequence[Candidate]", size: "Callable[[Candidate], float]", excuses: "Callable[[Candidate], bool]"
     ) -> "Candidate":
-        """Return the first, from the largest on, without which a row is plausible; the largest if there is none.
+        """Return the first value, from the largest on, without which a row is plausible; the largest if there is none.
 
         Args:
             candidates: values of several nodes that one filter judged together, and found implausible.
             size: of a value, by which they are ordered.
             excuses: whether the row is plausible without a value.
         """
-        ordered = sorted(candidates, key=size, reverse=True)
-        # Of one value alone nothing is computed again.
-        if len(ordered) == 1:
-            return ordered[0]
-        return next((one for one in ordered if excuses(one)), ordered[0])
+        largest_first = sorted(candidates, key=size, reverse=True)
+        if len(largest_first) == 1:  # nothing need be computed again
+            return largest_first[0]
+        return next((candidate for candidate in largest_first if excuses(candidate)), largest_first[0])
 
     @staticmethod
     def is_spoilt(reason: float) -> bool:
@@ -130,48 +141,49 @@ class Judgement(NamedTuple):
         return reason in (Reason.UNSOUND, Reason.PREDICTION)
 
     @staticmethod
-    def describe(reason: float, distance: float) -> str:
+    def describe(reason: float, squared_distance: float) -> str:
         """Describe in words why something is implausible, with the bound of the precision that the distance has.
 
-        `reason`: number of a `Reason`; `distance`: squared, in deviations; LIMIT: the bound in double precision, 1e6;
+        `reason`: number of a `Reason`; `squared_distance`: in deviations; LIMIT: the bound in double precision, 1e6;
         WORDS: texts of the other reasons.
         """
         if Reason(int(reason)) != Reason.FAR:
             return WORDS[Reason(int(reason))]
-        most = np.sqrt(largest_plausible_distance(np.asarray(distance).dtype))
-        bound = "1e6" if most == LIMIT else f"{most:,.0f}"
-        far = f"more than {bound} deviations from what was expected"
-        return far + (f" ({np.sqrt(distance):.3g} of them)" if np.isfinite(distance) else "")
+        largest_distance = np.sqrt(largest_plausible_distance(np.asarray(squared_distance).dtype))
+        bound = "1e6" if largest_distance == LIMIT else f"{largest_distance:,.0f}"
+        description = f"more than {bound} deviations from what was expected"
+        return description + (f" ({np.sqrt(squared_distance):.3g} of them)" if np.isfinite(squared_distance) else "")
 
     @staticmethod
-    def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+    def why_values(judgements: Float[np.ndarray, "filters 4"]) -> str | None:
         """Return why a measurement is implausible, None unless some filter judges it so and none that can disagrees.
 
         A single filter that has diverged, and judges all values implausible, does not exclude them for the others: it
         alone skips them. A filter that claims no covariance judges nothing but its state.
 
-        `votes`: one row for each filter: squared distance (NaN: cannot judge), numbers arrived, reason (0: plausible),
-        judgement of inputs.
+        `judgements`: one row for each filter: squared distance (NaN: cannot judge), numbers arrived, reason (0:
+        plausible), judgement of inputs.
         """
-        distance, _, reason, _ = votes.T
-        bad = reason > 0
-        if not bad.any() or (~bad & ~np.isnan(distance)).any():
+        squared_distance, _, reason, _ = judgements.T
+        is_implausible = reason > 0
+        if not is_implausible.any() or (~is_implausible & ~np.isnan(squared_distance)).any():
             return None
-        worst = int(np.argmax(bad))
-        return Judgement.describe(reason[worst], distance[worst])
+        first_filter = int(np.argmax(is_implausible))
+        return Judgement.describe(reason[first_filter], squared_distance[first_filter])
 
     @staticmethod
-    def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+    def why_inputs(judgements: Float[np.ndarray, "filters 4"]) -> str | None:
         """Return why inputs are implausible, None unless some filter judges them so and none that can disagrees.
 
-        `votes`: one row for each filter: squared distance, numbers arrived, reason, judgement of inputs (1: bad, NaN:
-        cannot judge). INPUT: the text for inputs that cost the mean its digits.
+        `judgements`: one row for each filter: squared distance, numbers arrived, reason, judgement of inputs (1:
+        implausible, NaN: cannot judge). INPUT: the text for inputs that cost the mean its digits.
         """
-        predicted = votes[:, 2] == Reason.PREDICTION
-        bad = (votes[:, 3] > 0) | predicted
-        if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
+        _, _, reason, of_inputs = judgements.T
+        by_prediction = reason == Reason.PREDICTION
+        is_implausible = (of_inputs > 0) | by_prediction
+        if not is_implausible.any() or (~is_implausible & ~np.isnan(of_inputs)).any():
             return None
-        return WORDS[Reason.PREDICTION] if predicted.any() else INPUT
+        return WORDS[Reason.PREDICTION] if by_prediction.any() else INPUT
 
 
 def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
@@ -181,8 +193,9 @@ def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
     """
     value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
-    total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
-    distance = squared_distance(total, jnp.where(present, value, 0.0))
+    unit_if_missing = jnp.diag(jnp.where(present, 0.0, 1.0))
+    covariance_with_missing = jnp.where(present[:, None] & present, covariance, unit_if_missing)
+    distance = squared_distance(covariance_with_missing, jnp.where(present, value, 0.0))
     return distance, jnp.sum(present).astype(distance.dtype)
 
 
@@ -289,8 +302,10 @@ def _squared_distance_terms_in_turn(
     e_j: innovation given the components before, s_j: its variance. `used`: which components count; `size`: of the
     numbers subtracted, for rounding. A determined one has no variance but rounding.
     """
-    padded = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
-    squares, determined = squared_distance_terms(padded, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
+    covariance_of_used = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
+    squares, determined = squared_distance_terms(
+        covariance_of_used, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0)
+    )
     return jnp.where(used, squares, 0.0), used & determined
 
 
@@ -330,12 +345,12 @@ def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Return whether some number of a state became infinite."""
-    overflows = jnp.asarray(False)
-    for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        if _is_real_array(new):
-            overflows |= jnp.any(jnp.isinf(jnp.asarray(new)) & ~jnp.isinf(jnp.asarray(old)))
-    return overflows
+    """Return whether some real number of a state became infinite: it is after the step, and was not before."""
+    has_overflowed = jnp.asarray(False)
+    for number_before, number_after in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        if _is_real_array(number_after):
+            has_overflowed |= jnp.any(jnp.isinf(jnp.asarray(number_after)) & ~jnp.isinf(jnp.asarray(number_before)))
+    return has_overflowed
 
 
 def _is_real_array(leaf: Array) -> bool:

@@ -45,8 +45,9 @@ class NoiseBranches(NamedTuple):
         Branches are the Gaussians of the mixture, along the second axis.
         """
         share = jnp.exp(self.log_share)
-        center = jnp.sum(share * self.mean, axis=1)
-        return center, jnp.sum(share * (self.variance + (self.mean - center[:, None]) ** 2), axis=1)
+        mean = jnp.sum(share * self.mean, axis=1)
+        second_about_mean = self.variance + (self.mean - mean[:, None]) ** 2
+        return mean, jnp.sum(share * second_about_mean, axis=1)
 
 
 class ReceivedNoise(Module):
@@ -69,26 +70,26 @@ class ReceivedNoise(Module):
     covariance: Float[jax.Array | np.ndarray, "m m"]
     degrees: Vector
 
-    def find_branches(self, sensed: jax.Array) -> NoiseBranches:
-        """Return the mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensed` (p,).
+    def find_branches(self, sensor_mean: jax.Array) -> NoiseBranches:
+        """Return mean and variance of every branch as it arrives, for a sensor's signal of the mean `sensor_mean` (p,).
 
-        Branch j of a noise before the gain arrives with mean E[g] m_j and variance
-        E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's spread acts on the signal and on the branch's
-        mean together. With that of the signal alone, Var(g) y^2, it is at least E[g^2] r_j.
+        A branch j is one Gaussian of the noise's mixture, of mean m_j and variance r_j. Before the random gain g it
+        arrives with mean E[g] m_j and variance E[g^2] (r_j + m_j^2) - E[g]^2 m_j^2 + 2 Var(g) y m_j: the gain's
+        spread acts on the signal y and on the branch's mean together. With that of the signal alone, Var(g) y^2, it
+        is at least E[g^2] r_j.
 
-        A branch is one Gaussian of the noise's mixture, with mean m_j and variance r_j; g: random gain, y: the signal;
-        `late`: noise behind the gain; `least`: the variance without the spread.
+        `late_mean`, `late_variance`: of noise behind the gain.
         """
         gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
-        signal = (self.output @ sensed)[:, None]
-        least = power * self.variance + self.late_variance
-        spread, both = power - gain**2, mean + 2 * signal
-        variance = least + spread * mean * both
+        signal = (self.output @ sensor_mean)[:, None]
+        without_spread = power * self.variance + self.late_variance
+        spread, mean_and_signal = power - gain**2, mean + 2 * signal
+        variance = without_spread + spread * mean * mean_and_signal
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),
             mean=jnp.asarray(gain * mean + self.late_mean),
             variance=jnp.asarray(variance),
-            least=jnp.asarray(least),
+            least=jnp.asarray(without_spread),
         )
 
 
@@ -149,7 +150,7 @@ def describe_outlier_noise(
     late_mean: Array = np.zeros(mean.shape)
     late_variance: Array = late_mean
     if late is not None:
-        log_share, mean, variance, late_mean, late_variance = _combine_branches(
+        log_share, mean, variance, late_mean, late_variance = _pair_branches(
             GaussianBranches(log_share, mean, variance), late.branches()
         )
     return ReceivedNoise(
@@ -160,28 +161,31 @@ def describe_outlier_noise(
 
 
 def _find_noisy_outputs(squares: Array, covariance: Array, plain: SecondOrder) -> np.ndarray:
-    """Return the sensor's output whose noise each received component brings, (m,).
+    """Return the sensor's output whose noise each received component carries, (m,).
 
     `squares` (m, p): E[G_ia^2] of the gain of output a in component i; `covariance` (p, p): of the sensor's noise.
-
-    TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared: then
-    each component brings the output of its own number.
+    TOLERANCE: 1e-12, the share of a gain that is zero but for rounding. Free numbers (traced) cannot be compared:
+    then each component carries the output of its own number.
 
     Raises:
-        ValueError: one that brings the noise of several.
+        ValueError: one that carries the noise of several.
     """
     m, p = squares.shape
     if is_traced(squares, covariance):
         if m != p:
             raise fail("channel with free numbers before a robust filter", f"{p} outputs", m)
         return np.arange(m)
-    brought = np.asarray(squares) * np.diag(np.asarray(covariance))
-    largest = np.max(brought, axis=1, keepdims=True, initial=0.0)
-    several = np.count_nonzero(brought > TOLERANCE**2 * largest, axis=1)
-    if np.any(several > 1):
+    noise_variance = np.asarray(squares) * np.diag(np.asarray(covariance))
+    largest = np.max(noise_variance, axis=1, keepdims=True, initial=0.0)
+    output_count = np.count_nonzero(noise_variance > TOLERANCE**2 * largest, axis=1)
+    if np.any(output_count > 1):
         expected = "one that brings each received number the noise of one output of the sensor"
-        raise fail("channel of a robust filter", expected, f"{several.max()} outputs in number {int(several.argmax())}")
-    return np.asarray(np.argmax(brought, axis=1))
+        raise fail(
+            "channel of a robust filter",
+            expected,
+            f"{output_count.max()} outputs in number {int(output_count.argmax())}",
+        )
+    return np.asarray(np.argmax(noise_variance, axis=1))
 
 
 def _check_weighable(covariance: Array, independent: bool) -> None:
@@ -206,7 +210,7 @@ def _check_weighable(covariance: Array, independent: bool) -> None:
         raise fail("noise of a robust filter", expected, f"correlations whose least eigenvalue is {least:.3g}")
 
 
-def _combine_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
+def _pair_branches(sensed: GaussianBranches, late: GaussianBranches) -> tuple[Array, ...]:
     """Return all pairs of a branch of the sensor and one of the last hop, (m, pairs) each.
 
     Log probabilities, means and variances of the sensor's, means and variances of the last hop's.
@@ -231,11 +235,11 @@ def _student_degrees(sensed: AbstractNoise, late: AbstractNoise | None) -> Vecto
 
     `late`: noise of the last hop, None if there is none; a sum of two is no Student noise.
     """
-    parts = sensed.parts if isinstance(sensed, Independent) else (sensed,)
+    independent_noises = sensed.parts if isinstance(sensed, Independent) else (sensed,)
     values = [
-        component.degrees * np.ones(component.dimension) if isinstance(component, StudentT) and late is None
-        else np.full(component.dimension, np.nan)
-        for component in parts
+        noise.degrees * np.ones(noise.dimension) if isinstance(noise, StudentT) and late is None
+        else np.full(noise.dimension, np.nan)
+        for noise in independent_noises
     ]  # fmt: skip
     degrees: Vector = library(values).concatenate(values)
     return degrees

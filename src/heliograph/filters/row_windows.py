@@ -25,11 +25,12 @@ def take_windows_in_parts(rows: PyTree, begin: Int[np.ndarray, " n"], length: in
 
     `begin`: first rows of the windows; the first ones follow one another within the data, and need no copy.
     """
-    total, place = len(jax.tree.leaves(rows)[0]), np.arange(len(begin)) * length
-    views = int(np.sum((begin == place) & (place + length <= total)))
-    for which in (slice(views), slice(views, None)):
-        if len(first := begin[which]):
-            yield WindowBatch(which, first, take_windows(rows, first, length))
+    total = len(jax.tree.leaves(rows)[0])
+    begin_if_adjacent = np.arange(len(begin)) * length
+    view_count = int(np.sum((begin == begin_if_adjacent) & (begin_if_adjacent + length <= total)))
+    for selection in (slice(view_count), slice(view_count, None)):
+        if len(first := begin[selection]):
+            yield WindowBatch(selection, first, take_windows(rows, first, length))
 
 
 def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyTree:
@@ -47,35 +48,42 @@ def take_windows(rows: PyTree, begin: Int[np.ndarray, " n"], length: int) -> PyT
     are_first_blocks = are_blocks and np.array_equal(begin, np.arange(len(begin)) * length)
 
     def take_from(leaf: np.ndarray) -> np.ndarray:
-        """Return the windows of one array: a view, blocks of rows, or copied one by one.
-
-        Closed over: `begin`, first rows of the windows; `length` of each; `total` rows; `are_first_blocks`: windows are
-        the first rows in order; `are_blocks`: each is a block of rows that begins at a multiple of the length.
-        """
+        """Return the windows of one array of rows: views where these may be, else copies."""
         if are_first_blocks:
-            return leaf[: len(begin) * length].reshape(len(begin), length, *leaf.shape[1:])
-        if are_blocks:
-            blocks = leaf[: total // length * length].reshape(total // length, length, *leaf.shape[1:])
-            return np.asarray(blocks[begin // length])
-        windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
-        for window, place in zip(windows, begin, strict=True):
-            part = leaf[place : place + length]
-            window[: len(part)] = part
-            # Behind the end of the data the last row is repeated.
-            window[len(part) :] = leaf[-1]
-        return windows
+            return _split_into_blocks(leaf, length)[: len(begin)]
+        return _split_into_blocks(leaf, length)[begin // length] if are_blocks else _copy_windows(leaf, begin, length)
 
     return jax.tree.map(take_from, rows)
 
 
-def run_and_join(function: Callable[..., PyTree], parts: Sequence[tuple[Any, ...]], differs: Sequence[bool]) -> PyTree:
-    """Return the results of runs of several lists of arguments in the same arrays; None without native code.
+def _split_into_blocks(leaf: np.ndarray, length: int) -> np.ndarray:
+    """Return rows in blocks of this length (blocks, length, ...), a view, without rows behind the last whole block."""
+    blocks = len(leaf) // length
+    return leaf[: blocks * length].reshape(blocks, length, *leaf.shape[1:])
 
-    `differs` says of which arguments each run has its own.
 
-    Lists of arguments differ in length of the axis of runs; the same compiled code computes all.
+def _copy_windows(leaf: np.ndarray, begin: Int[np.ndarray, " n"], length: int) -> np.ndarray:
+    """Return a copy of each window of an array of rows (n, length, ...), the last row repeated behind the data's end.
+
+    `begin`: number of the first row of each window.
     """
-    choices = [choose_code(function, arguments, differs) for arguments in parts]
+    windows: np.ndarray = np.empty((len(begin), length, *leaf.shape[1:]), leaf.dtype)
+    for window, first_row in zip(windows, begin, strict=True):
+        available = leaf[first_row : first_row + length]
+        window[: len(available)] = available
+        window[len(available) :] = leaf[-1]
+    return windows
+
+
+def run_and_join(
+    function: Callable[..., PyTree], calls: Sequence[tuple[Any, ...]], differs_by_run: Sequence[bool]
+) -> PyTree:
+    """Return the results of several calls, each of several runs, in the same arrays; None without native code.
+
+    `calls`: arguments of each; they differ in the number of runs, and the same compiled code computes all.
+    `differs_by_run`: which arguments each run has its own of.
+    """
+    choices = [choose_code(function, arguments, differs_by_run=differs_by_run) for arguments in calls]
     codes = [choice.code for choice in choices]
     return None if None in codes else codes[0].compute_calls([choice.arrays for choice in choices])
 

@@ -114,7 +114,8 @@ def scan_inside_jit(
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
     """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of each, stacked."""
-    return scan_with_last_state(filter, z, u, output)[1]
+    _, outputs = scan_with_last_state(filter, z, u, output)
+    return outputs
 
 
 def scan_with_last_state(
@@ -146,7 +147,8 @@ def scan_with_last_state(
         In a derivative the step is computed again, and only what carries a name in KEPT is held in memory.
         """
         k, z_k, u_k = row
-        after, innovation = filter.correct(filter.predict(state, u_k, k), z_k, k)
+        prior = filter.predict(state, u_k, k)
+        after, innovation = filter.correct(prior, z_k, k)
         return after, output(after, innovation, k)
 
     start = jax.tree.map(jnp.asarray, filter.init() if state is None else state)
@@ -207,8 +209,11 @@ def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, d
         u: inputs (rows, inputs).
         dates: of the rows; None where they have none, and their numbers are their times.
     """
-    last_time, spacing = (float(end - 1), np.nan) if dates is None else (dates[-1], find_median_spacing(dates))
-    months = 0 if dates is None else find_months_between_rows(dates)  # 0: spacing not in calendar months
+    if dates is None:
+        last_time, spacing, months = float(end - 1), np.nan, 0
+    else:
+        # 0 months: the spacing is not in calendar months.
+        last_time, spacing, months = dates[-1], find_median_spacing(dates), find_months_between_rows(dates)
     return Origin(
         model=filter,
         state=state,
@@ -225,11 +230,11 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
 
     hg.run judges each value; this call does not.
     """
-    lost = find_not_finite(mean, 1)
-    if lost.any():
-        row = begin + int(np.argmax(lost)) + 1
-        said = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
-        warnings.warn(f"{said}; hg.run leaves out what makes it so, and says which row and why", stacklevel=4)
+    is_invalid = find_not_finite(mean, axes=1)
+    if is_invalid.any():
+        row = begin + int(np.argmax(is_invalid)) + 1
+        finding = f"{type(filter).__name__}: the estimate is no finite number from row {row} on"
+        warnings.warn(f"{finding}; hg.run leaves out what makes it so, and says which row and why", stacklevel=4)
 
 
 def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
@@ -254,15 +259,16 @@ def _warn_of_few_particles(counts: Array, log_likelihoods: Array, begin: int) ->
 
     FEW: the least effective number of particles, 10. A row that none explains has log-likelihood -inf.
     """
-    unused = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
-    few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
-    if len(unused):
-        said = f"particle_filter: {len(unused)} of the rows are not used, first row {unused[0]}"
-        warnings.warn(f"{said}: no particle explains what arrived, and the state stays as it was", stacklevel=4)
-    if len(few):
-        least = float(np.min(np.asarray(counts)))
-        said = f"particle_filter: fewer than {FEW} particles count after {len(few)} of the rows, first row {few[0]}"
-        warnings.warn(f"{said} ({least:.2g} at least); take more of them", stacklevel=4)
+    unused_rows = begin + 1 + np.flatnonzero(np.isneginf(np.asarray(log_likelihoods)))
+    rows_of_few = begin + 1 + np.flatnonzero(np.asarray(counts) < FEW)
+    if len(unused_rows):
+        finding = f"particle_filter: {len(unused_rows)} of the rows are not used, first row {unused_rows[0]}"
+        warnings.warn(f"{finding}: no particle explains what arrived, and the state stays as it was", stacklevel=4)
+    if len(rows_of_few):
+        smallest = float(np.min(np.asarray(counts)))
+        affected_rows = f"{len(rows_of_few)} of the rows, first row {rows_of_few[0]}"
+        finding = f"particle_filter: fewer than {FEW} particles count after {affected_rows} ({smallest:.2g} at least)"
+        warnings.warn(f"{finding}; take more of them", stacklevel=4)
 
 
 def _compute_filtered(
@@ -296,8 +302,8 @@ def check_data(
     z = check_rows("measurements", measurements, None, filter.received or None, missing=True)
     z = z if filter.received else z[:, :0]
     # Without inputs a filter of none has rows of length 0; of any other filter `check_rows` refuses None.
-    given = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
-    u = check_rows("inputs", given, len(z), len(filter.inputs), missing=False, names=filter.inputs)
+    rows_of_inputs = np.zeros((len(z), 0)) if inputs is None and not filter.inputs else inputs
+    u = check_rows("inputs", rows_of_inputs, len(z), len(filter.inputs), missing=False, names=filter.inputs)
     check_inputs(filter.inputs, u, filter)
     if filter.horizon is not None and begin + len(z) > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", begin + len(z))

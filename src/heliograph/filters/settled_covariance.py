@@ -43,24 +43,24 @@ class SettledState(NamedTuple):
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
-        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary; the others are common.
+        """Return what is kept of rows (chunks, rows, ...), from the leaves that vary with data; the others are common.
 
-        `varies`: of each leaf, whether it depends on data; `outputs`: what a settled row keeps.
+        `self.varies`: of each leaf, whether it depends on data; `self.outputs`: what a settled row keeps.
         """
         chunks, rows = varying[0].shape[:2]
-        leaves, form = jax.tree.flatten(self.outputs)
+        leaves, structure = jax.tree.flatten(self.outputs)
 
-        def fill(leaf: np.ndarray) -> np.ndarray:
+        def repeat(leaf: np.ndarray) -> np.ndarray:
             """Return a leaf that does not vary, once for each row."""
             return repeat_row(leaf, chunks * rows).reshape(chunks, rows, *leaf.shape)
 
-        filled = [leaf if varies else fill(leaf) for leaf, varies in zip(leaves, self.varies, strict=True)]
-        return self._replace(outputs=jax.tree.unflatten(form, filled)).fill_row(varying)
+        filled = [leaf if varies else repeat(leaf) for leaf, varies in zip(leaves, self.varies, strict=True)]
+        return self._replace(outputs=jax.tree.unflatten(structure, filled)).fill_row(varying)
 
     def fill_row(self, varying: list[Any]) -> PyTree:
-        """Return what is kept of a row, from those of its leaves that vary; the others are common.
+        """Return what is kept of a row, from those of its leaves that vary with data; the others are common to all.
 
-        `varies`: of each leaf, whether it depends on data; `outputs`: what a settled row keeps.
+        `self.varies`: of each leaf, whether it depends on data; `self.outputs`: what a settled row keeps.
         """
         next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
@@ -73,15 +73,15 @@ class SettledState(NamedTuple):
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
         """Test which states (n, ...) are this one but for the means."""
         means = means_of(states)
-        # All leaves but the means, which are replaced by nothing.
-        beside, own = (jax.tree.leaves(with_means(x, [()] * len(means))) for x in (states, self.state))
+        no_means = [()] * len(means)  # in place of the means: leaves of nothing
+        other_leaves, own_leaves = (jax.tree.leaves(with_means(x, no_means)) for x in (states, self.state))
         # Most have the same numbers. The others may have others for the same covariance, which are compared by it.
-        same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(beside, own, strict=True)]
-        covered: np.ndarray = np.all(same, axis=0)
-        others = np.flatnonzero(~covered)
-        if len(others):
-            covered[others] = find_equal_states(
-                take(states, others), self.repeat_with_means([mean[others] for mean in means])
+        are_same = [(x == y).reshape(len(x), -1).all(axis=1) for x, y in zip(other_leaves, own_leaves, strict=True)]
+        covered: np.ndarray = np.all(are_same, axis=0)
+        unsure = np.flatnonzero(~covered)
+        if len(unsure):
+            covered[unsure] = find_equal_states(
+                take(states, unsure), self.repeat_with_means([mean[unsure] for mean in means])
             )
         return covered
 
@@ -102,7 +102,7 @@ def find_settled_state(recursion: Recursion, start: PyTree, rows: PyTree, ahead:
     if varies is None:
         return None
     arguments = recursion, start, row, np.arange(TURNS * ahead).reshape(2, -1)
-    choice = choose_code(_repeat_row_over_windows, arguments, [False] * len(arguments))
+    choice = choose_code(_repeat_row_over_windows, arguments, differs_by_run=[False] * len(arguments))
     return None if choice.code is None else find_unchanged_state(varies, *choice.results())
 
 
@@ -114,13 +114,15 @@ def find_unchanged_state(varies: tuple[bool, ...], after_windows: PyTree, output
         after_windows: states of one run after the first and the second of two windows of rows (1, 2, ...).
         outputs: what is kept of the last row of either (1, 2, ...).
     """
-    halfway, end = (jax.tree.map(lambda leaf, at=at: leaf[:, at], after_windows) for at in (0, 1))
+    after_first = jax.tree.map(lambda leaf: leaf[:, 0], after_windows)
+    after_second = jax.tree.map(lambda leaf: leaf[:, 1], after_windows)
     # Means follow the data, and are left out; all else must be the same.
-    zero_means = [np.zeros_like(mean) for mean in means_of(end)]
-    if not find_equal_states(with_means(end, zero_means), with_means(halfway, zero_means), ROUNDING)[0]:
+    zero_means = [np.zeros_like(mean) for mean in means_of(after_second)]
+    first_without_mean, second_without_mean = (with_means(state, zero_means) for state in (after_first, after_second))
+    if not find_equal_states(second_without_mean, first_without_mean, ROUNDING)[0]:
         return None
     # Of the axes (run, window) one run, and the second window.
-    state = jax.tree.map(lambda leaf: leaf[0, ...], end)
+    state = jax.tree.map(lambda leaf: leaf[0, ...], after_second)
     last_outputs = jax.tree.map(lambda leaf: leaf[0, 1, ...], outputs)
     return SettledState(state, last_outputs, varies)
 
@@ -150,17 +152,18 @@ def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, n
 def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
     """Return which leaves of what is kept of a complete row depend on data.
 
-    None if more than the means of the state depends on data, or without native code.
-
-    `choice.code.common`: of each result, whether runs with different data share it; `means` of states may differ.
+    None if more than the means of the state depends on data, or without native code. `choice.code.common`: of each
+    result, whether runs with different data share it.
     """
-    rows, means = jax.tree.map(lambda leaf: leaf[None], row), [np.asarray(mean)[None] for mean in means_of(start)]
+    rows = jax.tree.map(lambda leaf: leaf[None], row)
+    means = [np.asarray(mean)[None] for mean in means_of(start)]
     arguments = recursion, start, means, rows, np.zeros(1, int)
-    choice = choose_code(step_settled, arguments, [False, False, True, True, True])
+    choice = choose_code(step_settled, arguments, differs_by_run=[False, False, True, True, True])
     if choice.code is None:
         return None
     after, outputs = jax.tree.unflatten(choice.code.tree, choice.code.common)
-    if not all(jax.tree.leaves(with_means(after, [True] * len(means_of(after))))):
+    all_but_means = with_means(after, [True] * len(means_of(after)))
+    if not all(jax.tree.leaves(all_but_means)):
         return None
     return tuple(not common for common in jax.tree.leaves(outputs))
 
@@ -223,10 +226,14 @@ def means_after_settled_rows(
     """
 
     def step(means: list[jax.Array], row: tuple[PyTree, Array]) -> tuple[list[jax.Array], None]:
-        """Step over one row."""
-        return means_of(step_settled(recursion, settled.state, means, *row)[0]), None
+        """Step over one complete row from the settled state with these means; return the next means."""
+        data, k = row
+        after, _ = step_settled(recursion, settled.state, means, data, k)
+        return means_of(after), None
 
-    return jax.lax.scan(step, [jnp.asarray(mean) for mean in means], (rows, make_row_numbers(rows, first)))[0]
+    first_means = [jnp.asarray(mean) for mean in means]
+    last_means, _ = jax.lax.scan(step, first_means, (rows, make_row_numbers(rows, first)))
+    return last_means
 
 
 class CompleteBlocks(NamedTuple):
@@ -244,16 +251,17 @@ class CompleteBlocks(NamedTuple):
 def find_complete_blocks(z: PyTree, size: int) -> CompleteBlocks:
     """Return which blocks of `size` rows of measurements (rows, ...) lack no number.
 
-    Return the size, and how many of the first blocks are complete, block by block.
+    They are held as the size, and how many of the first 0, 1, 2, ... blocks are complete.
     """
     total = len(jax.tree.leaves(z)[0])
-    begin, complete = np.arange(0, total, size), np.ones(-(-total // size), bool)
+    begin = np.arange(0, total, size)
+    is_complete = np.ones(len(begin), bool)
     with np.errstate(over="ignore", invalid="ignore"):  # a sum of huge numbers is taken for one that lacks some
         for leaf in jax.tree.leaves(z):
             if leaf.size:
                 # A sum over a block is finite only if all of its numbers are.
-                complete &= np.isfinite(np.add.reduceat(leaf.reshape(-1), begin * (leaf.size // total)))
-    return CompleteBlocks(size, np.append(0, np.cumsum(complete)))
+                is_complete &= np.isfinite(np.add.reduceat(leaf.reshape(-1), begin * (leaf.size // total)))
+    return CompleteBlocks(size, np.append(0, np.cumsum(is_complete)))
 
 
 def repeat_state(state: PyTree, count: int) -> PyTree:

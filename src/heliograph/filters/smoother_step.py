@@ -186,8 +186,9 @@ class SmootherStep(Module):
             from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
 
             law = hold_mean_within_limits(from_columns(mean, columns), self.limits)
-            _, inside = truncate_to_limits(jax.tree.map(lambda leaf: leaf[None], law), self.limits)
-            return Estimate(wrap_angles(inside.mean[0], self.angles), inside.covariance[0], self.claim)
+            stack_of_one = jax.tree.map(lambda leaf: leaf[None], law)
+            _, truncated = truncate_to_limits(stack_of_one, self.limits)
+            return Estimate(wrap_angles(truncated.mean[0], self.angles), truncated.covariance[0], self.claim)
         mean = wrap_angles(mean, self.angles)
         return Estimate(mean, columns.covariance, self.claim, attitude=self.manifold.rotations)
 

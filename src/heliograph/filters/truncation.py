@@ -43,20 +43,19 @@ def truncate_gaussians(
 def hold_mean_within_limits(x: Gaussian, limits: PlacedLimits) -> Gaussian:
     """Move the mean to the most likely point within the limits, one after the other; the covariance stays.
 
-    The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays.
-
-    A limit: the component's index, low and high end.
+    The point of x_i = c that is most likely is m + P e_i (c - m_i) / P_ii. A component without variance stays. A
+    limit: the component's index i, low and high end.
 
     Source: Simon, Kalman filtering with state constraints (2010), Section 2.4, with P^-1 as weight.
     """
     mean, covariance = x.mean, x.columns
-    for place, low, high in limits:
-        product = covariance.weights * covariance.matrix[place]
-        column, value = covariance.matrix @ product, mean[place]
-        held = jnp.clip(value, low, high)
-        known = column[place] <= 0
-        moved = mean + column * ((held - value) / jnp.where(known, 1.0, column[place]))
-        mean = jnp.where(known, mean, moved.at[place].set(held))
+    for i, low, high in limits:
+        column = covariance.matrix @ (covariance.weights * covariance.matrix[i])  # P e_i
+        value = mean[i]
+        nearest = jnp.clip(value, low, high)
+        is_certain = column[i] <= 0
+        most_likely = mean + column * ((nearest - value) / jnp.where(is_certain, 1.0, column[i]))
+        mean = jnp.where(is_certain, mean, most_likely.at[i].set(nearest))
     return x._replace(mean=mean)
 
 
@@ -70,12 +69,12 @@ def truncate_to_limits(x: Gaussian, limits: PlacedLimits) -> tuple[jax.Array, Ga
 
     Source: Simon and Simon, Constrained Kalman filtering via density function truncation (2010).
     """
-    total = jnp.zeros(len(x.mean))
-    for place, low, high in limits:
+    log_probability = jnp.zeros(len(x.mean))
+    for i, low, high in limits:
         # A limit from above alone is one from below of -x, as `truncate_gaussians` needs it.
         sign = 1.0 if np.isfinite(low) else -1.0
-        centre, row = sign * x.mean[:, place], sign * x.root[:, place]
+        mean, slopes = sign * x.mean[:, i], sign * x.root[:, i]
         ends = sorted(sign * end for end in (low, high) if np.isfinite(end))
-        log_mass, x = truncate_gaussians(x, centre, row, [jnp.full(len(x.mean), end) for end in ends])
-        total = total + log_mass
-    return total, x
+        log_mass, x = truncate_gaussians(x, mean, slopes, [jnp.full(len(x.mean), end) for end in ends])
+        log_probability = log_probability + log_mass
+    return log_probability, x

@@ -216,7 +216,7 @@ def predict_moments_of_each(
     """
     arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
     with jax.enable_x64(True):
-        choice = choose_code(_predict_moments, (outlook, *arguments), [False, True, True, True])
+        choice = choose_code(_predict_moments, (outlook, *arguments), differs_by_run=[False, True, True, True])
         if choice.code is not None:
             found: tuple[Moments | None, ...] = choice.results()
             return found

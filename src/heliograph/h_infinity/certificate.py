@@ -46,10 +46,9 @@ class HInfinityCertificate(NamedTuple):
         """Guarantee, and the growth constants that it rests on, in one line."""
         if not self.certified:
             return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
-        rests = (
-            f"assumed: {'; '.join(self.assumed)}" if self.assumed else "growth constants proved in their boxes, or zero"
-        )
-        return f"level {self.level:g} is certified; {rests}"
+        all_proved = "growth constants proved in their boxes, or zero"
+        basis = f"assumed: {'; '.join(self.assumed)}" if self.assumed else all_proved
+        return f"level {self.level:g} is certified; {basis}"
 
 
 def certify_level(
@@ -83,7 +82,7 @@ def certify_level(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, TINY, LARGEST))
+    level = float(scalar("level", level, low=TINY, high=LARGEST))
     findings = {"f": _list_findings("growth", growth), "h": _list_findings("output growth", output_growth)}
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))
@@ -136,8 +135,9 @@ def _list_objections(growth: Growth, findings: Sequence[GrowthFinding]) -> list[
         if finding.refuted:
             reasons.append(finding.text)
         elif not any(_finding_covers(finding, value) for value in constants):
-            known = ", ".join(sorted({f"{value:g}" for value in constants})) or "none"
-            reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
+            names = ", ".join(sorted({f"{value:g}" for value in constants})) or "none"
+            text = f"a finding about the constant {finding.constant:g}, the system has {names}"
+            reasons.append(f"{finding.name}: {text}")
     return reasons
 
 
@@ -160,16 +160,16 @@ def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[Grow
     finding's box.
     """
     around_zero = [finding for finding in findings if finding.around_zero]
-    itself, differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
+    of_function, of_differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
     assumed = []
-    for constants, what, relevant in (
-        (growth.state, itself, around_zero),
-        (growth.error, differences, findings),
+    for constants, condition, relevant in (
+        (growth.state, of_function, around_zero),
+        (growth.error, of_differences, findings),
     ):
         for value in _list_positive(constants):
-            about = [finding for finding in relevant if _finding_covers(finding, value)]
-            if not about or not all(finding.proved for finding in about):
-                assumed.append(f"{what} with a = {value:g}")
+            findings_of_constant = [finding for finding in relevant if _finding_covers(finding, value)]
+            if not findings_of_constant or not all(finding.proved for finding in findings_of_constant):
+                assumed.append(f"{condition} with a = {value:g}")
     return assumed
 
 
@@ -181,9 +181,10 @@ def _list_wrong_signs(
     ROUNDING: 1e-12, up to which an eigenvalue has no sign.
     """
     smallest = np.array([smallest_eigenvalue(p) for p in weights])
-    not_definite = np.flatnonzero(~(smallest > ROUNDING))
-    reasons = [f"P_{k} is not positive definite ({smallest[k]:.3g})" for k in not_definite]
-    return reasons + [f"step {k}: a multiplier is negative" for k in np.flatnonzero((multipliers < 0).any(axis=1))]
+    indefinite = np.flatnonzero(~(smallest > ROUNDING))
+    reasons = [f"P_{k} is not positive definite ({smallest[k]:.3g})" for k in indefinite]
+    negative_steps = np.flatnonzero((multipliers < 0).any(axis=1))
+    return reasons + [f"step {k}: a multiplier is negative" for k in negative_steps]
 
 
 def make_theorem_matrix(
@@ -222,14 +223,15 @@ def make_theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
-        """Return rows over eta that multiply its parts by these blocks, by the letter of the part.
+        """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
 
-        eta: vector of all that a step depends on, q long; `at`: first place of each part in it, by letter.
+        eta: vector of all that a step depends on; `at`: first place of each part in it, by letter. The other parts
+        have zeros.
         """
-        wide = np.zeros((height, q))
+        matrix = np.zeros((height, q))
         for name, block in blocks.items():
-            wide[:, at[name] : at[name] + block.shape[1]] = block
-        return wide
+            matrix[:, at[name] : at[name] + block.shape[1]] = block
+        return matrix
 
     # V eta, E[G] (C xhat + h(xhat)) and R eta.
     v_eta = np.concatenate([rows(y, x=C, h=eye(y), v=D), rows(r, r=eye(r))])
@@ -288,27 +290,27 @@ def _add_growth(
 def _drop_absent_functions(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
-    """Return Phi without f and f~, or h and h~, where the function is zero throughout.
+    """Return Phi without the rows and columns of f and f~, or of h and h~, where the function is zero throughout.
 
-    at: the first row of each part of eta; f~ stands behind f, and h~ behind h.
-
-    Phi is the quadratic form of a step in eta = (x, e, f, f~, h, h~, v, rho); `y`: length of h; f~, h~: differences.
+    Phi is the quadratic form of a step in eta = (x, e, f, f~, h, h~, v, rho): f is the plant's nonlinear part, f~ its
+    difference between x and its estimate, h and h~ (`y` long) the sensor's. `at`: the first row of each part of eta,
+    by letter.
     """
-    kept = list(range(len(phi)))
+    kept_rows = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
-            kept = [i for i in kept if not at[name] <= i < at[name] + width]
-    return np.asarray(phi[np.ix_(kept, kept)])
+            kept_rows = [i for i in kept_rows if not at[name] <= i < at[name] + width]
+    return np.asarray(phi[np.ix_(kept_rows, kept_rows)])
 
 
-def _complete_multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
+def _complete_multipliers(multipliers: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
     """Return the multipliers of f, f~, h, h~ from 2 or 4 for each step.
 
     2: one for (f, f~) and one for (h, h~), each of which counts for both.
     """
-    if given.shape[1] not in (2, 4):
-        raise fail("multipliers", "2 or 4 for each step", given.shape[1])
-    return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
+    if multipliers.shape[1] not in (2, 4):
+        raise fail("multipliers", "2 or 4 for each step", multipliers.shape[1])
+    return multipliers if multipliers.shape[1] == 4 else np.repeat(multipliers, 2, axis=1)
 
 
 def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:

@@ -33,14 +33,15 @@ def known_channel_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    level = float(scalar("level", level, TINY, GREATEST))
+    level = float(scalar("level", level, low=TINY, high=GREATEST))
     if any(len(link.spreads()) for link in system.channel):
         raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
-    given = np.zeros((system.steps, 2)) if multipliers is None else array("multipliers", multipliers, (system.steps, 2))
+    shape = (system.steps, 2)
+    values = np.zeros(shape) if multipliers is None else array("multipliers", multipliers, shape)
     for growth, column, name in ((system.growth, 0, "f~"), (system.output_growth, 1, "h~")):
-        if not growth.absent and np.any(given[:, column] <= 0):
-            raise fail(f"multipliers of {name}", "positive ones, since it is not zero", given[:, column].min())
-    return _run_riccati(system, level, given)
+        if not growth.absent and np.any(values[:, column] <= 0):
+            raise fail(f"multipliers of {name}", "positive ones, since it is not zero", values[:, column].min())
+    return _run_riccati(system, level, values)
 
 
 def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
@@ -128,8 +129,11 @@ def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[f
 
     a, b: growth constants of f and h, |f(x)| <= a |x|; `state`: the present weight; f = 0 has any multiplier.
     """
-    size, a, b = np.linalg.norm(system.transition[k], 2), system.growth.state[k], system.output_growth.state[k]
-    next_state = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))
-    multiplier_f = next_state * (1 + SPARE) ** 2 * float(1 + size / a) if a > 0 else next_state * 10 / SPARE
+    norm_of_a = np.linalg.norm(system.transition[k], 2)
+    a, b = system.growth.state[k], system.output_growth.state[k]
+    next_weight = state / ((1 + SPARE) ** 3 * max(float(norm_of_a + a) ** 2, 1.0))
+    multiplier_f = next_weight * 10 / SPARE
+    if a > 0:
+        multiplier_f = next_weight * (1 + SPARE) ** 2 * float(1 + norm_of_a / a)
     multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))
-    return next_state, (multiplier_f, multiplier_h)
+    return next_weight, (multiplier_f, multiplier_h)

@@ -100,7 +100,7 @@ def recursive_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
-    target = None if level is None else float(scalar("level", level, TINY, LARGEST))
+    target = None if level is None else float(scalar("level", level, low=TINY, high=LARGEST))
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _check_initial_weight(initial, system.states)
@@ -194,15 +194,13 @@ def _find_first_failing(
 ) -> int | None:
     """Return the number of the first step whose inequality a solution does not satisfy; None where all hold.
 
-    solved: each step's unknowns; weights: P before each step, in scaled coordinates; square: the level squared.
-
-    SCREEN: strictness that must be left, relative to the level squared. `fixed`: the part of the inequality without
-    unknowns.
+    `solved`: each step's unknowns; `weights`: P before each step, in scaled coordinates; `square`: the level squared,
+    of which SCREEN is the share that must be left. `fixed`: the part of the inequality without unknowns.
     """
     for k, (step, unknowns) in enumerate(zip(steps, solved, strict=True)):
         fixed = step.target - square * step.energy
         fixed[: len(weights[k]), : len(weights[k])] -= weights[k]
-        if not _inequality_holds(step, unknowns, fixed, SCREEN * square):
+        if not _inequality_holds(step, unknowns, fixed, strictness=SCREEN * square):
             return k
     return None
 
@@ -258,15 +256,14 @@ class _RecursiveDesigner:
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         """Return the problem of step k, the one compiled before where its matrices and sizes are the same.
 
-        A weight `start` that couples x and e makes a problem of its own.
-
-        `sizes`: scales of x and e before the next step; a weight is P of (x, e).
+        A weight P of (x, e), `start`, that couples x and e makes a problem of its own. `sizes`: scales of x and e
+        before the next step.
         """
         step, sizes = self.steps[k], self.coordinates.relative_scales(k + 1)
         coupling = _coupled_initial_weight(start, self.system.states)
         for old_step, old_sizes, old_coupling, problem in self.compiled:
-            same_step = all(map(np.array_equal, old_step, step)) and old_sizes == sizes
-            if same_step and coupling is None and old_coupling is None:
+            is_same_step = all(map(np.array_equal, old_step, step)) and old_sizes == sizes
+            if is_same_step and coupling is None and old_coupling is None:
                 return problem
         problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
         self.compiled.append((step, sizes, coupling, problem))
@@ -288,15 +285,14 @@ def _inequality_holds(
 ) -> bool:
     """Decide whether one step is feasible: P1, P2 > 0, and Phi with Z = K'P2 K itself strictly negative.
 
-    fixed: the part of Phi without unknowns, S - diag(P, 0).
-
-    P1, P2 (`state`, `error`): next weights; K: gain; Phi: the matrix of the step's inequality in eta, S - diag(P, 0)
-    without unknowns.
+    P1, P2 (`state`, `error`): next weights; K: gain; Phi: the matrix of the step's inequality in eta; `fixed`: its
+    part without unknowns, S - diag(P, 0).
     """
     gain = _gain_correction(unknowns)
     exact = unknowns._replace(product=unknowns.error @ gain, gain_square=gain.T @ unknowns.error @ gain)
-    positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
-    return bool(positive and np.linalg.eigvalsh(compute_next_energy(step, exact) + fixed)[-1] < -strictness)
+    are_positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
+    phi = compute_next_energy(step, exact) + fixed
+    return bool(are_positive and np.linalg.eigvalsh(phi)[-1] < -strictness)
 
 
 def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:

@@ -193,8 +193,8 @@ def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     It is the weight of (x, e), the first state and error of n components each; a number stands for that times I.
     """
     name, size = "initial weight", 2 * n
-    single = rank(name, value) == 0
-    matrix: np.ndarray = scalar(name, value) * np.eye(size) if single else array(name, value, (size, size))
+    is_number = rank(name, value) == 0
+    matrix: np.ndarray = scalar(name, value) * np.eye(size) if is_number else array(name, value, (size, size))
     unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
     symmetric = symmetric_weight("initial weight", matrix / unit)
     if smallest_eigenvalue(symmetric) <= 0:
@@ -212,9 +212,9 @@ def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float
     if largest > LARGEST:
         raise fail(name, f"entries of at most {LARGEST:g}", f"{largest:g}")
     unit = standard_deviations(matrix)
-    skew = np.abs(matrix - np.swapaxes(matrix, -1, -2))
-    if np.any(skew > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):
-        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
+    asymmetry = np.abs(matrix - np.swapaxes(matrix, -1, -2))
+    if np.any(asymmetry > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):
+        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(asymmetry):.3g} across the diagonal")
     return np.asarray((matrix + np.swapaxes(matrix, -1, -2)) / 2)
 
 

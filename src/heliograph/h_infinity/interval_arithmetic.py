@@ -149,9 +149,10 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
 
     `equation`: the operation of a traced program, such as a reshape or a look-up.
     """
-    if any(a.low.dtype.kind in "iu" and not np.array_equal(a.low, a.high) for a in x):
+    if any(interval.low.dtype.kind in "iu" and not np.array_equal(interval.low, interval.high) for interval in x):
         raise NoIntervalError("a place that depends on x")
-    lows, highs = _apply_to_numbers(equation, [a.low for a in x]), _apply_to_numbers(equation, [a.high for a in x])
+    lows = _apply_to_numbers(equation, [interval.low for interval in x])
+    highs = _apply_to_numbers(equation, [interval.high for interval in x])
     return [Interval(low, high) for low, high in zip(lows, highs, strict=True)]
 
 
@@ -179,19 +180,21 @@ def _compare(name: str, a: Interval, b: Interval) -> Interval:
 def _select_case(x: list[Interval]) -> Interval:
     """Return the interval of cases[which], x = [which, *cases].
 
-    Where `which` is open, from the lowest of the possible cases to the highest.
+    Where `case_number` is open, from the lowest of the possible cases to the highest.
 
-    `which`: interval of a whole number; open where its ends differ.
+    `case_number`: interval of a whole number; open where its ends differ.
     """
-    which, cases = x[0], x[1:]
-    lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
-    first, last = which.low.astype(int), which.high.astype(int)
+    case_number, cases = x[0], x[1:]
+    lows = np.broadcast_arrays(*[case.low for case in cases])
+    highs = np.broadcast_arrays(*[case.high for case in cases])
+    lowest_case, highest_case = case_number.low.astype(int), case_number.high.astype(int)
     low, high = np.full(lows[0].shape, np.inf), np.full(lows[0].shape, -np.inf)
     for i, (a, b) in enumerate(zip(lows, highs, strict=True)):
-        possible = (first <= i) & (i <= last)
-        low, high = np.where(possible, np.minimum(low, a), low), np.where(possible, np.maximum(high, b), high)
-    kind = cases[0].low.dtype
-    return Interval(low.astype(kind), high.astype(kind))
+        is_possible = (lowest_case <= i) & (i <= highest_case)
+        low = np.where(is_possible, np.minimum(low, a), low)
+        high = np.where(is_possible, np.maximum(high, b), high)
+    dtype = cases[0].low.dtype
+    return Interval(low.astype(dtype), high.astype(dtype))
 
 
 def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
@@ -206,16 +209,18 @@ def _bound_quotient(a: Interval, b: Interval) -> Interval:
     """Return an interval of x / y; all numbers where y may be 0."""
     holds_zero = (b.low <= 0) & (b.high >= 0)
     # A divisor of 1 where 0 is possible: what is computed there is not used.
-    safe = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
-    ends = [x / y for x in a for y in safe]
+    divisor = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
+    ends = [x / y for x in a for y in divisor]
     low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
     return round_outward(np.where(holds_zero, -np.inf, low), np.where(holds_zero, np.inf, high))
 
 
 def _bound_square(a: Interval) -> Interval:
     """Return the interval of x^2, from 0 where x may be 0; as x * x it would begin at low * high."""
-    low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
-    square = round_outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
+    squares_of_ends = a.low**2, a.high**2
+    low, high = np.minimum(*squares_of_ends), np.maximum(*squares_of_ends)
+    holds_zero = (a.low <= 0) & (a.high >= 0)
+    square = round_outward(np.where(holds_zero, 0.0, low), high)
     return Interval(np.maximum(square.low, 0.0), square.high)
 
 
@@ -225,11 +230,10 @@ def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
     ULPS: units in the last place by which a power may be off. Even powers depend on |x| alone.
     """
     if exponent < 0:
-        return _bound_quotient(point_interval(np.ones_like(a.low)), _raise_interval_to_power(a, -exponent))
-    if exponent % 2 == 0:
-        inner = _bound_absolute(a)
-        return round_outward(inner.low**exponent, inner.high**exponent, ULPS)
-    return round_outward(a.low**exponent, a.high**exponent, ULPS)
+        unit_interval = point_interval(np.ones_like(a.low))
+        return _bound_quotient(unit_interval, _raise_interval_to_power(a, -exponent))
+    base = _bound_absolute(a) if exponent % 2 == 0 else a
+    return round_outward(base.low**exponent, base.high**exponent, ULPS)
 
 
 def _bound_absolute(a: Interval) -> Interval:
@@ -259,12 +263,13 @@ def _bound_cosine(a: Interval) -> Interval:
     ends = np.cos(a.low), np.cos(a.high)
     cosine = round_outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     # Ends in multiples of pi, widened by more than their rounding.
-    first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
-    holds_top = np.floor(last / 2) >= np.ceil(first / 2)
-    holds_bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
-    infinite = ~(np.isfinite(a.low) & np.isfinite(a.high))
-    low = np.where(holds_bottom | infinite, -1.0, cosine.low)
-    high = np.where(holds_top | infinite, 1.0, cosine.high)
+    low_in_pi = a.low / np.pi - 1e-9 * (1 + np.abs(a.low))
+    high_in_pi = a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
+    holds_even_multiple = np.floor(high_in_pi / 2) >= np.ceil(low_in_pi / 2)
+    holds_odd_multiple = np.floor((high_in_pi - 1) / 2) >= np.ceil((low_in_pi - 1) / 2)
+    is_infinite = ~(np.isfinite(a.low) & np.isfinite(a.high))
+    low = np.where(holds_odd_multiple | is_infinite, -1.0, cosine.low)
+    high = np.where(holds_even_multiple | is_infinite, 1.0, cosine.high)
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 

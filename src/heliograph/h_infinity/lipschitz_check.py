@@ -91,15 +91,15 @@ class GrowthFinding(NamedTuple):
     @property
     def text(self) -> str:
         """Verdict and evidence in one line."""
-        where = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
+        region = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
-            return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
+            return f"{self.name}: constant {self.constant:g} is proved {region} (no slope above {self.bound:.6g})"
         if not self.refuted:
-            proved = "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
-            why = self.reason or proved
-            verdict = f"not refuted {where} (largest slope {self.slope:.6g})"
-            return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {why}"
-        return f"{self.name}: constant {self.constant:g} is false {where}: {self._describe_evidence()}"
+            finding = "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
+            reason = self.reason or finding
+            verdict = f"not refuted {region} (largest slope {self.slope:.6g})"
+            return f"{self.name}: constant {self.constant:g} is assumed: {verdict}; {reason}"
+        return f"{self.name}: constant {self.constant:g} is false {region}: {self._describe_evidence()}"
 
     def _describe_evidence(self) -> str:
         """Return in words what refutes the constant: f(0), the slope at a point, or the ratio |df| / |dx| of a pair."""
@@ -107,7 +107,7 @@ class GrowthFinding(NamedTuple):
             return f"f(0) has the norm {self.at_zero:.6g}, not 0"
         if self.ratio <= self.limit:
             return f"slope {self.slope:.6g} at {np.round(self.point, 6).tolist()}"
-        x, y = (np.round(p, 6).tolist() for p in self.pair)
+        x, y = (np.round(point, 6).tolist() for point in self.pair)
         return f"ratio {self.ratio:.6g} at {x} and {y}"
 
 
@@ -143,7 +143,7 @@ def check_growth(
         ValueError: a negative constant, a box of the wrong shape, upside down, or without 0 where it has to be in it.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
-    constant = float(scalar("growth constant", constant, 0.0))
+    constant = float(scalar("growth constant", constant, low=0.0))
     bottom, top = _check_box(low, high)
     differences = flag("differences", differences)
     seed = check_seed("seed", seed)
@@ -193,9 +193,9 @@ class _LipschitzMeter:
     def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Return the norm of the Jacobian at each point; infinite where it is no number."""
         values = np.asarray(self.jacobian(points))
-        finite = np.isfinite(values).all(axis=(-2, -1))
-        safe = np.where(finite[:, None, None], values, 0.0)
-        return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
+        is_finite = np.isfinite(values).all(axis=(-2, -1))
+        finite_values = np.where(is_finite[:, None, None], values, 0.0)
+        return np.where(is_finite, np.linalg.norm(finite_values, 2, axis=(-2, -1)), np.inf)
 
     def find_steepest_directions(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Return the unit direction in which the function changes most at each point."""
@@ -205,9 +205,10 @@ class _LipschitzMeter:
         """Return the ratio |f(x) - f(y)| / |x - y| of each pair; 0 for points too close for it to have digits."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
-        apart = distance > NEARBY * self.width / 2  # NEARBY: 1e-4
+        are_apart = distance > NEARBY * self.width / 2  # NEARBY: 1e-4
         change = np.linalg.norm(np.asarray(self.values(x)) - self.values(y), axis=1)
-        return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
+        change = np.where(np.isfinite(change), change, np.inf)
+        return np.where(are_apart, change / np.where(are_apart, distance, 1), 0)
 
     def measure_at_zero(self, n: int) -> float:
         """Return the size |f(0)|, infinite where it is no number."""
@@ -381,12 +382,12 @@ def _bound_slopes(
     ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
     (jacobian,) = bound_program(slopes, [Interval(*ends)], continuous=False)
     # |J| <= |C| + |R| for J in C +- R.
-    finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
-    least, largest = np.where(finite, jacobian.low, 0.0), np.where(finite, jacobian.high, 0.0)
-    centre = least / 2 + largest / 2
-    radius = np.nextafter(np.maximum(largest - centre, centre - least), np.inf)
-    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius)) * (1 + NORM_ROUNDING)
-    return np.where(finite.all(axis=(1, 2)), norms, np.inf)[: len(low)]
+    is_finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
+    lowest, highest = np.where(is_finite, jacobian.low, 0.0), np.where(is_finite, jacobian.high, 0.0)
+    centre = lowest / 2 + highest / 2
+    radius = np.nextafter(np.maximum(highest - centre, centre - lowest), np.inf)
+    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius))
+    return np.where(is_finite.all(axis=(1, 2)), norms * (1 + NORM_ROUNDING), np.inf)[: len(low)]
 
 
 def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -394,6 +395,6 @@ def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2
-    left, right = high.copy(), low.copy()  # high ends of the left, low of the right
-    left[rows, sides] = right[rows, sides] = middle
-    return np.concatenate([low, right]), np.concatenate([left, high])
+    high_of_left, low_of_right = high.copy(), low.copy()
+    high_of_left[rows, sides] = low_of_right[rows, sides] = middle
+    return np.concatenate([low, low_of_right]), np.concatenate([high_of_left, high])

@@ -124,8 +124,8 @@ def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> F
     """
     if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
-    deviations = [np.full(len(p), np.sqrt(np.trace(p) / len(p))) for p in (x, e)]
-    return np.diag(np.concatenate([_powers_of_four_near(sizes) for sizes in deviations]))
+    deviations = [np.full(len(covariance), np.sqrt(np.trace(covariance) / len(covariance))) for covariance in (x, e)]
+    return np.diag(np.concatenate([_powers_of_four_near(deviation) for deviation in deviations]))
 
 
 def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -134,9 +134,8 @@ def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray
     SMALLEST: 1e-6 of each deviation. Units are powers of four, by which scaling has no rounding.
     """
     unit = _powers_of_four_near(np.sqrt(np.diagonal(covariance)))
-    return np.asarray(
-        unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
-    )
+    scaled = covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit))
+    return np.asarray(unit[:, None] * np.linalg.cholesky(scaled))
 
 
 def _powers_of_four_near(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -196,8 +195,8 @@ def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: 
 
     CONVERGED: 0.1, the share of each variance that it may add. A gain that stays makes steps alike, compiled once.
     """
-    more = (last - best) @ received @ (last - best).T
-    return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
+    added = (last - best) @ received @ (last - best).T
+    return last if np.all(np.diagonal(added) <= CONVERGED * np.diagonal(after)) else best
 
 
 def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
@@ -207,12 +206,13 @@ def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: 
     disturbances are of order one.
     """
     n, y = system.states, system.output.shape[1]
-    parts = [sizes]
+    blocks = [sizes]
     for growth, width in ((system.growth, n), (system.output_growth, y)):
         if not growth.absent:
             for constant, size in ((growth.state[k], sizes[0, 0]), (growth.error[k], sizes[n, n])):
-                parts.append((constant * size if constant > 0 else size) * np.eye(width))
-    return np.asarray(block_diag(*parts, np.eye(len(step.energy) - sum(map(len, parts)))))
+                blocks.append((constant * size if constant > 0 else size) * np.eye(width))
+    disturbances = len(step.energy) - sum(map(len, blocks))
+    return np.asarray(block_diag(*blocks, np.eye(disturbances)))
 
 
 def _rescale_step(

@@ -48,9 +48,9 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
     `choices`: a type alias, such as `type Solver = Literal["clarabel", "scs"]`.
     """
-    known = get_args(choices.__value__)
-    if not isinstance(value, str) or value not in known:
-        raise fail(name, f"one of {', '.join(known)}", show_value(value))
+    allowed = get_args(choices.__value__)
+    if not isinstance(value, str) or value not in allowed:
+        raise fail(name, f"one of {', '.join(allowed)}", show_value(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:

@@ -60,8 +60,11 @@ def list_step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrice
     """
     # The U_j of every step, as many at each: zeros where there are fewer.
     spreads = [link.spreads() for link in system.channel]
-    count = max(len(s) for s in spreads)
-    padded = [np.concatenate([s, np.zeros((count - len(s), *s.shape[1:]))]) for s in spreads]
+    count = max(len(of_step) for of_step in spreads)
+    padded = []
+    for of_step in spreads:
+        zeros = np.zeros((count - len(of_step), *of_step.shape[1:]))
+        padded.append(np.concatenate([of_step, zeros]))
     return [_make_step_matrices(system, k, padded[k], separate) for k in range(system.steps)]
 
 
@@ -74,11 +77,13 @@ def complete_multipliers(
 
     f~, h~: differences of f and h at the state and its estimate; a function is absent if it is zero throughout.
     """
-    items = 2 if separate else 1
-    present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(items)]
-    full = np.zeros((*given.shape[:-1], len(present)))
-    full[..., present] = given
-    return full
+    multipliers_by_function = 2 if separate else 1
+    is_present = [
+        not growth.absent for growth in (system.growth, system.output_growth) for _ in range(multipliers_by_function)
+    ]
+    multipliers = np.zeros((*given.shape[:-1], len(is_present)))
+    multipliers[..., is_present] = given
+    return multipliers
 
 
 def _make_step_matrices(
@@ -145,8 +150,10 @@ def _locate_parts_of_eta(system: GrowthSystem, k: int) -> _PartsOfEta:
     place.
     """
     n, y = system.states, system.output.shape[1]
-    f, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
-    sizes = [n, n, f, f, h, h, system.disturbance.shape[2], system.channel[k].disturbances]
+    size_of_f = 0 if system.growth.absent else n
+    size_of_h = 0 if system.output_growth.absent else y
+    disturbances = system.disturbance.shape[2], system.channel[k].disturbances
+    sizes = [n, n, size_of_f, size_of_f, size_of_h, size_of_h, *disturbances]
     ends = np.cumsum(sizes).tolist()
     return _PartsOfEta(*(slice(end - size, end) for size, end in zip(sizes, ends, strict=True)))
 
@@ -161,12 +168,14 @@ def _list_growth_forms(
     q: length of eta; f~, h~ (`f_error`, `h_error`): differences of f and h.
     """
     growth, output_growth = system.growth, system.output_growth
-    pairs = []
+    pairs_of_conditions = []
     if not growth.absent:
-        pairs.append([(eta.f, eta.x, growth.state[k]), (eta.f_error, eta.e, growth.error[k])])
+        pairs_of_conditions.append([(eta.f, eta.x, growth.state[k]), (eta.f_error, eta.e, growth.error[k])])
     if not output_growth.absent:
-        pairs.append([(eta.h, eta.x, output_growth.state[k]), (eta.h_error, eta.e, output_growth.error[k])])
-    groups = [[condition] for pair in pairs for condition in pair] if separate else pairs
+        pairs_of_conditions.append(
+            [(eta.h, eta.x, output_growth.state[k]), (eta.h_error, eta.e, output_growth.error[k])]
+        )
+    groups = [[condition] for pair in pairs_of_conditions for condition in pair] if separate else pairs_of_conditions
     q = eta.rho.stop
     return np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q)
 
@@ -193,9 +202,9 @@ def compute_next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndar
     cross = E.T @ Y @ U
     form = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
     # The random part is corrected by the whole gain K0 + K: (K0 + K)'P2 (K0 + K), with Z in place of K'P2 K.
-    shifted = step.nominal.T @ Y
-    whole = Z + shifted + shifted.T + step.nominal.T @ p2 @ step.nominal
-    form += np.einsum("jai,ab,jbk->ik", step.spreads, whole, step.spreads)
+    cross_gain = step.nominal.T @ Y
+    whole_gain_weight = Z + cross_gain + cross_gain.T + step.nominal.T @ p2 @ step.nominal
+    form += np.einsum("jai,ab,jbk->ik", step.spreads, whole_gain_weight, step.spreads)
     return np.asarray(form + np.diag(multipliers @ step.growth))
 
 
@@ -217,8 +226,8 @@ class UnknownsLayout(NamedTuple):
         Triangles of two weights (n, n), the gain's unknowns unless it is given, and multipliers.
         """
         n, m = self.states, self.received
-        free = n * m + m * (m + 1) // 2 if self.gain is None else 0
-        return n * (n + 1) + free + self.multipliers
+        unknowns_of_gain = n * m + m * (m + 1) // 2 if self.gain is None else 0
+        return n * (n + 1) + unknowns_of_gain + self.multipliers
 
     def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
         """Return the unknowns: triangles of P1 and P2, then Y and a triangle of Z, then the multipliers.
@@ -235,8 +244,9 @@ class UnknownsLayout(NamedTuple):
         if self.gain is not None:
             Y = p2 @ self.gain
             return Unknowns(p1, p2, Y, self.gain.T @ Y, multipliers)
-        rest = vector[2 * triangle :]
-        Y, triangle_of_z = rest[: n * m].reshape(n, m), rest[n * m : n * m + m * (m + 1) // 2]
+        after_weights = vector[2 * triangle :]
+        Y = after_weights[: n * m].reshape(n, m)
+        triangle_of_z = after_weights[n * m : n * m + m * (m + 1) // 2]
         return Unknowns(p1, p2, Y, _mirror_lower_triangle(triangle_of_z, m), multipliers)
 
 
@@ -275,15 +285,14 @@ def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms
     gain that is given, None where it is unknown.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
-    forward = np.array([compute_next_energy(step, u).ravel() for u in units]).T
-    positive = [np.array([u.state.ravel() for u in units]).T]
+    forward = np.array([compute_next_energy(step, unit).ravel() for unit in units]).T
+    state_form = np.array([unit.state.ravel() for unit in units]).T
     if layout.gain is None:
-        positive.append(
-            np.array([np.block([[u.gain_square, u.product.T], [u.product, u.error]]).ravel() for u in units]).T
-        )
+        blocks = [np.block([[unit.gain_square, unit.product.T], [unit.product, unit.error]]) for unit in units]
     else:
-        positive.append(np.array([u.error.ravel() for u in units]).T)
-    return LinearForms(forward, tuple(positive), make_weight_form(layout))
+        blocks = [unit.error for unit in units]
+    error_form = np.array([block.ravel() for block in blocks]).T
+    return LinearForms(forward, (state_form, error_form), make_weight_form(layout))
 
 
 def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
@@ -292,8 +301,9 @@ def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
     P1, P2: weights of state and error after the step.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
-    upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
-    return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
+    first_block, second_block = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
+    weights = [np.kron(first_block, unit.state) + np.kron(second_block, unit.error) for unit in units]
+    return np.array([weight.ravel() for weight in weights]).T
 
 
 def find_independent_parts(
@@ -306,10 +316,10 @@ def find_independent_parts(
     Phi: matrix of the step's inequality in eta, q long, which begins with x and e of n components each.
     """
     q = len(step.energy)
-    coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)
+    are_coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)
     n = step.state.shape[0]
-    coupled[:n, :n] = coupled[n : 2 * n, n : 2 * n] = True  # the weight diag(P1, P2) of this step
+    are_coupled[:n, :n] = are_coupled[n : 2 * n, n : 2 * n] = True  # the weight diag(P1, P2) of this step
     if start is not None:
-        coupled[: 2 * n, : 2 * n] |= start != 0
-    count, labels = connected_components(coupled, directed=False)
+        are_coupled[: 2 * n, : 2 * n] |= start != 0
+    count, labels = connected_components(are_coupled, directed=False)
     return [np.flatnonzero(labels == i) for i in range(count)]

@@ -48,7 +48,7 @@ def make_plant_and_measurement_maps(
 
     Of noises the moments up to `order` are tabulated, once for steps that share them.
     """
-    plants = _convert_to_affine_maps(list_checked_steps(plant, horizon), order)
+    plants = _tabulate_affine_maps(list_checked_steps(plant, horizon), order)
     sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
         measurements = [_make_measurement_maps(sensors[:1], channels[:1], order)[0]] * horizon
@@ -72,10 +72,10 @@ def _make_measurement_maps(
         apart += [] if by_link is None else [by_link]
     if len(apart) == len(sensors):
         return apart
-    return [Series(pair) for pair in zip(_convert_to_affine_maps(sensors, order), channels, strict=True)]
+    return [Series(pair) for pair in zip(_tabulate_affine_maps(sensors, order), channels, strict=True)]
 
 
-def _convert_to_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
+def _tabulate_affine_maps(models: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """Return the map x -> A x + noise of each plant or sensor, with the noise's moments tabulated up to `order`.
 
     `check_model` has seen that all are linear, with A in `matrix`. A step whose model is the same object as the one

@@ -57,8 +57,8 @@ class AbstractRandomAffine(Module):
     def __init_subclass__(cls, **options: object) -> None:
         """Wrap the class's own `moments`, which may return the matrix alone, so that it returns `JointMoments`."""
         super().__init_subclass__(**options)
-        if (written := cls.__dict__.get("moments")) is not None:
-            type.__setattr__(cls, "moments", give_moments(written))
+        if (own_moments := cls.__dict__.get("moments")) is not None:
+            type.__setattr__(cls, "moments", give_moments(own_moments))
 
     @property
     def outputs(self) -> int:
@@ -87,20 +87,20 @@ class AbstractRandomAffine(Module):
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
         """Draw the state before the first draw; () where the map forgets: each draw is independent of the last."""
-        held = memories(self)  # of links inside, by identity
-        if not held:
+        memories_inside = memories(self)  # of links inside, by identity
+        if not memories_inside:
             return self._init(key)
         # A key for each memory, which is drawn once even where several maps inside share it, and one for the maps.
-        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        key_of_maps, *keys = jax.random.split(key, len(memories_inside) + 1)
         return init_with_shared_memories(self, key_of_maps, keys)
 
     def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw the next state, of the same structure and shapes, and H = [[G, n], [0, 1]] (outputs + 1, inputs + 1)."""
-        held = memories(self)
-        if not held:
+        memories_inside = memories(self)
+        if not memories_inside:
             return self._draw(state, key)
         # A key for each memory, which moves once even where several maps inside share it, and one for the maps.
-        key_of_maps, *keys = jax.random.split(key, len(held) + 1)
+        key_of_maps, *keys = jax.random.split(key, len(memories_inside) + 1)
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
@@ -124,10 +124,10 @@ class AbstractRandomAffine(Module):
             ValueError: the map remembers, so that there is no draw without its state.
         """
         if self.remembers:
-            raise fail(
-                f"sample of {type(self).__name__}", "a map that forgets", "one that remembers; use init and draw"
-            )
-        return self.draw((), key)[1]
+            title = f"sample of {type(self).__name__}"
+            raise fail(title, "a map that forgets", "one that remembers; use init and draw")
+        _, matrix = self.draw((), key)
+        return matrix
 
     def moments(self, order: int) -> JointMoments:
         """Return the nominal E[Sym^order(H)], which takes monomials of (y, 1) to means of those of (z, 1).
@@ -162,8 +162,8 @@ class AbstractRandomAffine(Module):
         above, or where they are not counted (None), intervals of the parts are multiplied: sound but not attained.
         """
         check_forgets("channel of a bound", self)
-        corners = count_corners(self)
-        if corners is None or corners > CORNERS:
+        corner_count = count_corners(self)
+        if corner_count is None or corner_count > CORNERS:
             return self._interval_of_parts(order)
         matrices = self.corner_moments(order)
         return matrices.min(axis=0), matrices.max(axis=0)
@@ -236,7 +236,7 @@ class AbstractRandomAffine(Module):
         check_forgets("channel with erasures", self)
         if not self.erases:
             return [ArrivalOutcome(1.0, self, np.ones(self.outputs, dtype=bool))]
-        return [o for o in self._outcomes() if is_traced(o.probability) or o.probability > 0]
+        return [case for case in self._outcomes() if is_traced(case.probability) or case.probability > 0]
 
     def _outcomes(self) -> list["ArrivalOutcome"]:
         """Return the sets of losses of a map that erases; by default a refusal."""
@@ -286,11 +286,11 @@ class AbstractRandomAffine(Module):
         """
         if are_same(self, own):
             return True
-        believed, parts = self.in_series, own.in_series
-        if len(believed) == 1 == len(parts):
-            return believed[0].covers_kind(parts[0], same_noise)
-        pairs = zip(believed, parts, strict=False)
-        return len(believed) == len(parts) and all(x.covers(y, same_noise) for x, y in pairs)
+        own_series, other_series = self.in_series, own.in_series
+        if len(own_series) == 1 == len(other_series):
+            return own_series[0].covers_kind(other_series[0], same_noise)
+        pairs = zip(own_series, other_series, strict=False)
+        return len(own_series) == len(other_series) and all(x.covers(y, same_noise) for x, y in pairs)
 
     def covers_kind(self, own: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
         """Return whether `own`, no series, is covered as `covers` says; by default only an equal one is."""
@@ -332,11 +332,11 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these in place of its `inner_maps`; itself where they are the same ones."""
     leaves, tree = _flatten_to_inner_maps(channel)  # in which an inner map is a leaf
-    among, new = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
-    changed = [next(new) if is_map else leaf for is_map, leaf in zip(among, leaves, strict=True)]
-    same = all(after is before for after, before in zip(changed, leaves, strict=True))
-    rebuilt: T = channel if same else jax.tree.unflatten(tree, changed)
-    return rebuilt
+    are_maps, next_map = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
+    changed = [next(next_map) if is_map else leaf for is_map, leaf in zip(are_maps, leaves, strict=True)]
+    are_unchanged = all(after is before for after, before in zip(changed, leaves, strict=True))
+    result: T = channel if are_unchanged else jax.tree.unflatten(tree, changed)
+    return result
 
 
 def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:

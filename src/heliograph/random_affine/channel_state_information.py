@@ -43,11 +43,7 @@ class AbstractFreshDraw(AbstractMemory):
         return self.begin(key)
 
     def nodes(self, degree: int) -> MemoryStates:
-        """Refuse to list states: what a message tells is no hidden mode that a filter must find out.
-
-        Raises:
-            ValueError: always.
-        """
+        """Raise ValueError: what a message tells is no hidden mode, whose states a filter would weigh."""
         expected = "a filter that takes what a message tells, such as linear_filter or extended_filter"
         raise fail("filter of a link whose gain or noise is told", expected, "one of joint modes")
 
@@ -67,6 +63,7 @@ class FreshNumbers(AbstractFreshDraw):
     identity: str = eqx.field(static=True)
 
     def __init__(self, law: AbstractLaw | AbstractNoise | None, count: int, name: str | None = None):
+        """Hold the joint law of `count` numbers and the name under which links share them."""
         self.law, self.count, self.name, self.identity = law, count, name, identify_memory(name)
 
     @property
@@ -99,16 +96,17 @@ class FreshReading(AbstractFreshDraw):
     identity: str = eqx.field(static=True)
 
     def __init__(self, law: AbstractLaw, variance: Float[Array, ""]):
+        """Hold the law of the gain g and the variance of the reading error e."""
         self.law = require_density(law)
         self.variance = scalar("noise of a pilot", variance, np.finfo(float).tiny)
-        self.name, self.identity = None, identify_memory(None)
+        self.name, self.identity = None, identify_memory(name=None)
 
     def announce(self, state: int | float | jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         """Return the reading."""
         return jnp.asarray(state)[1:]
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the gain g and its reading g + e, e of the variance: (2,)."""
+        """Draw the gain g and its reading a = g + e, e with the variance `variance`: (2,)."""
         gain_key, error_key = jax.random.split(key)
         gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])
@@ -128,9 +126,9 @@ class AbstractToldMap(AbstractModal):
     @property
     def reason_for_no_claim(self) -> str:
         """Why no covariance is claimed from what is told, as said of the numbers ("depends ..."); "" if one is."""
-        said = ["depends on the state"] * (not self.exogenous)
-        said += ["leaves open what is not drawn anew with each message"] * (not self.fresh)
-        return " and ".join(said)
+        of_state = [] if self.exogenous else ["depends on the state"]
+        of_past = [] if self.fresh else ["leaves open what is not drawn anew with each message"]
+        return " and ".join(of_state + of_past)
 
     def _describe_told_numbers(self, what: str) -> str:
         """Return in brackets what is told, and what is not promised of it."""
@@ -187,6 +185,7 @@ class ToldMap(AbstractToldMap):
         exogenous: bool = True,
         fresh: bool = True,
     ):
+        """Hold the memory that draws the numbers and the function `make(numbers)`; check `make(typical)`."""
         self.memory, self.make, self.example, self.names = memory, make, typical, names
         self.exogenous, self.fresh = exogenous, fresh
         link = in_float64(make)(typical)
@@ -229,13 +228,11 @@ class ToldMap(AbstractToldMap):
         """
         if isinstance(self.make, ToldGainHop):
             return super().numbers_give_law(numbers)
-        link, usual = self.believed(numbers), self.believed(jnp.asarray(self.typical))
+        link, typical_link = self.believed(numbers), self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
-        noises = [
-            _is_covariance(b, t)
-            for b, t in zip(_list_noise_covariances(link), _list_noise_covariances(usual), strict=True)
-        ]
-        return jnp.all(jnp.stack([*finite, *noises]))
+        pairs = zip(_list_noise_covariances(link), _list_noise_covariances(typical_link), strict=True)
+        valid = [_is_covariance(matrix, typical) for matrix, typical in pairs]
+        return jnp.all(jnp.stack([*finite, *valid]))
 
     def in_words(self) -> str:
         """Return the map of typical numbers in words, and what is told."""
@@ -271,6 +268,7 @@ class PilotedHop(AbstractHop, AbstractToldMap):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, memory: FreshReading, matrix: Matrix, noise: AbstractNoise, fresh: bool = True):
+        """Hold the drawn gain with its reading, the matrix A and the law of the noise n."""
         self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
         self.exogenous, self.fresh = True, fresh
 
@@ -317,9 +315,9 @@ def list_told_numbers_of_outputs(channel: AbstractRandomAffine) -> Bool[np.ndarr
     """Return which of the numbers that a message tells each output of a channel depends on: those of its own maps."""
     identities = [affine.memory.identity for affine in list_told_maps(channel) for _ in range(affine.memory.announced)]
     rows = list[list[bool]]()
-    for part in channel.in_parallel:
-        own = {affine.memory.identity for affine in list_told_maps(part)}
-        rows += [[identity in own for identity in identities]] * part.outputs
+    for parallel_map in channel.in_parallel:
+        identities_of_map = {affine.memory.identity for affine in list_told_maps(parallel_map)}
+        rows += [[identity in identities_of_map for identity in identities]] * parallel_map.outputs
     return np.array(rows)
 
 
@@ -330,11 +328,11 @@ def condition_on_told_numbers(channel: T, numbers: Numbers) -> T:
         channel: a channel, whose other memories stay.
         numbers: what is told of all its maps, one after another.
     """
-    parts = _share_numbers_by_map(channel, numbers)
+    numbers_by_memory = _share_numbers_by_map(channel, numbers)
 
     def believe(leaf: object) -> object:
-        """Return a map as its receiver knows it given its numbers (`parts`, by memory), anything else as it is."""
-        return leaf.believed(parts[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
+        """Return a map as its receiver knows it given its numbers, anything else as it is."""
+        return leaf.believed(numbers_by_memory[leaf.memory.identity]) if isinstance(leaf, AbstractToldMap) else leaf
 
     conditioned: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
     return conditioned
@@ -347,18 +345,18 @@ def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Arr
         channel: a channel.
         numbers: what is told of all its maps, one after another.
     """
-    parts, told = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
-    return jnp.all(jnp.stack([affine.numbers_give_law(parts[affine.memory.identity]) for affine in told]))
+    by_memory, told_maps = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
+    return jnp.all(jnp.stack([affine.numbers_give_law(by_memory[affine.memory.identity]) for affine in told_maps]))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
     """Return the numbers told of each map of a channel, which stand one after another, by its memory's identity."""
     assert isinstance(channel, AbstractRandomAffine)
-    parts, start = dict[str, Numbers](), 0
+    numbers_by_memory, start = dict[str, Numbers](), 0
     for affine in list_told_maps(channel):
-        parts[affine.memory.identity] = numbers[start : start + affine.memory.announced]
+        numbers_by_memory[affine.memory.identity] = numbers[start : start + affine.memory.announced]
         start += affine.memory.announced
-    return parts
+    return numbers_by_memory
 
 
 def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
@@ -371,9 +369,9 @@ def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarr
     """Decide whether a matrix is a covariance to rounding, with variances of 0 only where `typical` has them too."""
     lower, pivots = eliminate(jnp.asarray(matrix))
     variances = jnp.diagonal(jnp.asarray(matrix))
-    positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
-    off = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)  # 0 if L diag(d) L', d >= 0
-    return jnp.all(positive) & jnp.all(off <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
+    are_positive = (variances > 0) | (jnp.asarray(jnp.diagonal(jnp.asarray(typical)) == 0) & (variances == 0))
+    residual = jnp.abs(lower @ jnp.diag(jnp.maximum(pivots, 0.0)) @ lower.T - matrix)  # 0 if L diag(d) L', d >= 0
+    return jnp.all(are_positive) & jnp.all(residual <= FACTOR_TOLERANCE * jnp.sqrt(jnp.outer(variances, variances)))
 
 
 def make_laws_certain(link: T) -> T:
@@ -391,8 +389,8 @@ def make_laws_certain(link: T) -> T:
             return eqx.tree_at(lambda modal: modal.memory, leaf, CertainChain(leaf.memory))
         return leaf
 
-    known: T = jax.tree.map(certain, link, is_leaf=lambda leaf: isinstance(leaf, Discrete | AbstractModal))
-    return known
+    certain_link: T = jax.tree.map(certain, link, is_leaf=lambda leaf: isinstance(leaf, Discrete | AbstractModal))
+    return certain_link
 
 
 def _is_told_map(leaf: object) -> bool:

@@ -88,9 +88,10 @@ class AbstractOneOfSeveralMaps(AbstractRandomAffine):
         A hop is a transmitter with its link; the position counts those before it.
         All maps begin at `position`: hops at equal places are the same transmitters in each of them.
         """
-        pairs = [affine.visit_hops(visit, position) for affine in self.maps]
-        visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in pairs])
-        return visited, max((after for _, after in pairs), key=lambda after: after.hops)
+        visited_maps = [affine.visit_hops(visit, position) for affine in self.maps]
+        visited: AbstractRandomAffine = replace_inner_maps(self, [affine for affine, _ in visited_maps])
+        positions = [after for _, after in visited_maps]
+        return visited, max(positions, key=lambda position: position.hops)
 
     def check_shapes(self, name: str) -> None:
         """Raise ValueError, with the `name` of what has these maps, where they have several shapes."""

@@ -74,6 +74,7 @@ class DelayLine(AbstractDelayLine):
     steps: int = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, past: int):
+        """Hold the link, a map of the present signal stacked over the `past` ones before it, newest first."""
         check_maps("link", [link])
         # The link takes a line of 1 + past signals: the present one and past ones.
         self.link, self.steps = link, check_count("past", past)
@@ -123,6 +124,7 @@ class DelayedLink(AbstractDelayLine):
     timestamped: bool = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
+        """Hold the link and, for each possible delay d, the selection S_d of y_{k-d} with its probability or mode."""
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
@@ -147,8 +149,8 @@ class DelayedLink(AbstractDelayLine):
         if not self.timestamped:
             return Series([self.delay, self.link])
         m = self.link.inputs
-        rows = np.eye(m + 1)
-        return Series([self.delay, Stack([Series([known(rows[:m]), self.link]), known(rows[m:])])])
+        signal_rows, stamp_row = np.split(np.eye(m + 1), [m])
+        return Series([self.delay, Stack([Series([known(signal_rows), self.link]), known(stamp_row)])])
 
     @property
     def past(self) -> int:
@@ -194,7 +196,7 @@ def _list_delays(delay: Delay) -> tuple[int, ...]:
             values = [delay]
         case _:
             raise fail("delay", "a number of steps, a Discrete law or a MarkovChain of it", show_value(delay))
-    return tuple(check_count("delay", d, 0) for d in values)
+    return tuple(check_count("delay", d, least=0) for d in values)
 
 
 def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
@@ -205,7 +207,8 @@ def _make_delay_selection(d: int, longest: int, size: int, timestamped: bool) ->
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
     if not timestamped:
         return known(rows)
-    return known(np.pad(rows, ((0, 1), (0, 0))), np.append(np.zeros(size), float(d)))
+    with_row_for_stamp = np.pad(rows, ((0, 1), (0, 0)))
+    return known(with_row_for_stamp, offset=np.append(np.zeros(size), float(d)))
 
 
 def place_on_delay_line(channel: T) -> T:
@@ -235,8 +238,8 @@ def place_channel_of_part(channel: AbstractRandomAffine, total: int, start: int,
     longest, size = channel.past, signal_size(channel)
     # The rows of the line that the channel takes: its part of each signal, present and past.
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(longest + 1)])
-    chosen = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
-    return DelayLine(chosen, past) if past else chosen
+    on_line = Series([known(np.eye((1 + past) * total)[rows]), place_on_delay_line(channel) if longest else channel])
+    return DelayLine(on_line, past) if past else on_line
 
 
 class RelayStorage(AbstractMapWrapper):
@@ -279,16 +282,16 @@ class RelayStorage(AbstractMapWrapper):
 
         The state: that of `base`, the link, and the `steps` receptions (gain and noise as drawn) that are stored.
         """
-        inner, before = state
-        inner, h = self.base.draw(inner, key)
+        base_state, stored = state
+        base_state, matrix = self.base.draw(base_state, key)
         # Each reception takes its own part of the line: that of t steps ago begins t signals later.
-        receptions = jnp.concatenate([h[None, :-1], before])
-        rows = [
+        receptions = jnp.concatenate([matrix[None, :-1], stored])
+        blocks = [
             jnp.pad(reception[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
             for t, reception in enumerate(receptions)
         ]
-        top = jnp.concatenate([jnp.concatenate(rows), receptions[..., -1].reshape(-1, 1)], axis=1)
-        return (inner, receptions[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
+        top = jnp.concatenate([jnp.concatenate(blocks), receptions[..., -1].reshape(-1, 1)], axis=1)
+        return (base_state, receptions[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
 class RelayedLinks(AbstractDelayLine):
@@ -307,10 +310,10 @@ class RelayedLinks(AbstractDelayLine):
 
         A stage that delays takes past outputs of the one before, which are therefore stored for `past` steps.
         """
-        size, whole = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
+        size, line_map = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
-            whole = Series([RelayStorage(whole, size, stage.past), place_on_delay_line(stage)])
-        return whole
+            line_map = Series([RelayStorage(line_map, size, stage.past), place_on_delay_line(stage)])
+        return line_map
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the outputs that are angles behind each stage in turn."""
@@ -381,15 +384,15 @@ def _join_links_behind_delay(links: Sequence[AbstractRandomAffine]) -> AbstractR
     return DelayedLink(chain, delay, timestamped=any(timestamped))
 
 
-def _lengthen_delay(link: DelayedLink, more: int) -> Delay:
+def _lengthen_delay(link: DelayedLink, added_steps: int) -> Delay:
     """Return a link's delay with a number of steps more; a chain's as it is, since its mode is the number of steps.
 
     The link holds a random delay as a choice or as modes of maps; `times` are the possible delays.
     """
     match link.delay:
         case Mixture():
-            times = np.array(link.times, dtype=float) + more
+            times = np.array(link.times, dtype=float) + added_steps
             return Discrete(times, link.delay.choice.probabilities, link.delay.choice.radius)
         case Modes():
             return link.delay.memory
-    return link.times[0] + more
+    return link.times[0] + added_steps

@@ -22,8 +22,9 @@ class Erasure(AbstractMapWrapper):
     arrival: Float[jax.Array | np.ndarray, ""]
 
     def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
+        """Hold the map `base` and the probability `arrival` that its outputs are received."""
         (self.base,) = check_maps("erasure", [base])
-        self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
+        self.arrival = scalar("arrival probability", arrival, low=0.0, high=1.0)
 
     @property
     def erases(self) -> bool:
@@ -32,10 +33,10 @@ class Erasure(AbstractMapWrapper):
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw whether it arrives, and the map, whose state moves in any case; all of a lost one is NaN."""
-        arrives, drawn = jax.random.split(key)
-        state, h = self.base.draw(state, drawn)
-        lost = ~jax.random.bernoulli(arrives, self.arrival)
-        return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
+        arrival_key, base_key = jax.random.split(key)
+        state, matrix = self.base.draw(state, base_key)
+        is_lost = ~jax.random.bernoulli(arrival_key, self.arrival)
+        return state, matrix.at[:-1].set(jnp.where(is_lost, jnp.nan, matrix[:-1]))
 
     def condition_on_arrival(self) -> AbstractRandomAffine:
         """Return what arrives through the map."""
@@ -46,9 +47,12 @@ class Erasure(AbstractMapWrapper):
 
         An outcome: its probability, the map then, and which outputs arrive.
         """
-        arrival, lost = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
-        listed = [o._replace(probability=arrival * o.probability) for o in self.base.list_outcomes()]
-        return [*listed, ArrivalOutcome(1 - arrival, known(np.zeros((self.outputs, self.inputs))), lost)]
+        arrival, none_arrives = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
+        outcomes = [
+            outcome._replace(probability=arrival * outcome.probability) for outcome in self.base.list_outcomes()
+        ]
+        zero_map = known(np.zeros((self.outputs, self.inputs)))
+        return [*outcomes, ArrivalOutcome(1 - arrival, zero_map, none_arrives)]
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the angles of the map: what is lost is none."""

@@ -84,6 +84,7 @@ class GainAndNoise(AbstractHop):
     def __init__(
         self, law: AbstractLaw, matrix: "Float[ArrayLike, 'm p']", noise: "AbstractNoise | Float[ArrayLike, '*m']"
     ):
+        """Hold the law of the scalar gain g, the matrix A and the law of the additive noise n."""
         if not isinstance(law, AbstractLaw):
             raise fail("gain of a hop", "a law (Constant for a number)", show_value(law))
         self.law = law
@@ -93,11 +94,10 @@ class GainAndNoise(AbstractHop):
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw H = [[g A, n], [0, 1]] of z = g A y + n: a random gain g and a noise n."""
         gain_key, noise_key = jax.random.split(key)
-        top = jnp.concatenate(
-            [self.law.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],
-            axis=1,
-        )
-        return jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
+        gain = self.law.sample(gain_key) * jnp.asarray(self.matrix)
+        noise = self.noise.sample(noise_key)[:, None]
+        top, bottom = jnp.concatenate([gain, noise], axis=1), np.eye(1, self.inputs + 1, self.inputs)
+        return jnp.concatenate([top, bottom], axis=0)
 
     @property
     def remembers(self) -> bool:
@@ -108,8 +108,10 @@ class GainAndNoise(AbstractHop):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`."""
         gains = tabulate_gain_moments(self.law, order)
-        basis = self.gain_coefficients(order)
-        return JointMoments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
+        coefficients = self.gain_coefficients(order)
+        return JointMoments(
+            library(gains, coefficients).tensordot(gains, coefficients, axes=1), self.outputs, self.inputs, order
+        )
 
     @cache_by_object
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
@@ -119,10 +121,12 @@ class GainAndNoise(AbstractHop):
         """
         rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
-        deterministic = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
-        row, column, rest, ways = plan_binomial_sums(self.outputs, order)
-        terms = (ways * noise_moment_vector(self.noise, order)[rest])[:, None] * deterministic[column]
-        return scatter((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
+        of_known_map = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
+        row, column, remainder, binomials = plan_binomial_sums(self.outputs, order)
+        noise_moments = noise_moment_vector(self.noise, order)
+        terms = (binomials * noise_moments[remainder])[:, None] * of_known_map[column]
+        power_of_gain = degrees(self.outputs, order)[column]
+        return scatter((order + 1, rows, columns), (power_of_gain, row), terms)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Return one map for each extreme law of the gain."""
@@ -134,8 +138,8 @@ class GainAndNoise(AbstractHop):
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
         """Return E[Sym^order(H)] = sum_k E[g^k] B_k at each corner: an extreme law of the gain g that is possible."""
-        gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
-        moment_map: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
+        gains, coefficients = self.law.corner_moments(order), self.gain_coefficients(order)
+        moment_map: jax.Array | np.ndarray = library(gains, coefficients).tensordot(gains, coefficients, axes=1)
         return moment_map
 
     def _interval_of_parts(self, order: int) -> Interval:
@@ -143,10 +147,11 @@ class GainAndNoise(AbstractHop):
 
         B_k, the `gain_coefficients`, are known; where an entry is negative the lower moment gives the higher product.
         """
-        basis, xp = self.gain_coefficients(order), library(self.gain_coefficients(order))
-        ends = [self.law.moment_interval(k) for k in range(order + 1)]
+        coefficients = self.gain_coefficients(order)
+        xp = library(coefficients)
+        gain_intervals = [self.law.moment_interval(k) for k in range(order + 1)]
         lows, highs = [], []
-        for b, (low, high) in zip(basis, ends, strict=True):
+        for b, (low, high) in zip(coefficients, gain_intervals, strict=True):
             lows.append(xp.minimum(b * low, b * high))
             highs.append(xp.maximum(b * low, b * high))
         return sum(lows), sum(highs)
@@ -159,9 +164,9 @@ class GainAndNoise(AbstractHop):
 
     def carry_known_gains(self, known: KnownGains) -> KnownGains:
         """Return which outputs have a known gain: those that take nothing but `known` inputs, by a constant gain."""
-        takes = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
-        rows: KnownGains = (self.law.constant is not None) & ~np.any(takes & ~known, axis=1)
-        return rows
+        is_used = np.ones(self.matrix.shape, bool) if is_traced(self.matrix) else np.asarray(self.matrix) != 0
+        are_known: KnownGains = (self.law.constant is not None) & ~np.any(is_used & ~known, axis=1)
+        return are_known
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the outputs that are angles: those that take one angle by a gain of 1, and nothing else."""
@@ -240,9 +245,9 @@ class GainAndNoise(AbstractHop):
 def affine_matrix(matrix: Matrix) -> Matrix:
     """Return [[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
-    right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
+    zero_column, last_row = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
-    extended: Matrix = xp.concatenate([xp.concatenate([matrix, right], axis=1), below])
+    extended: Matrix = xp.concatenate([xp.concatenate([matrix, zero_column], axis=1), last_row])
     return extended
 
 
@@ -263,5 +268,6 @@ def known(matrix: "Float[ArrayLike, 'm p']", offset: "Float[ArrayLike, ' m'] | N
         ValueError: shapes that do not fit, or numbers that are not finite.
     """
     a = array("matrix", matrix, ("outputs", "inputs"))
-    b = np.zeros(a.shape[0]) if offset is None else array("offset", offset, (a.shape[0],))
-    return GainAndNoise(Constant(1.0), a, Gaussian(np.zeros((a.shape[0], a.shape[0])), b))
+    m = a.shape[0]
+    b = np.zeros(m) if offset is None else array("offset", offset, (m,))
+    return GainAndNoise(Constant(1.0), a, Gaussian(np.zeros((m, m)), mean=b))

@@ -107,16 +107,16 @@ class AbstractMemory(Module):
 
     def labelled(self, label: str) -> "AbstractMemory":
         """Return a copy that no link refers to yet, without a name, identified by `label` alone."""
-        twin = copy(self)  # a construction would check numbers that may be stacked over time
-        object.__setattr__(twin, "name", None)
-        object.__setattr__(twin, "identity", label)
-        return twin
+        labelled_copy = copy(self)  # a construction would check numbers that may be stacked over time
+        object.__setattr__(labelled_copy, "name", None)  # fields are frozen
+        object.__setattr__(labelled_copy, "identity", label)
+        return labelled_copy
 
     def named(self, name: str) -> "AbstractMemory":
         """Return a copy with this name, one memory with all others of the name."""
-        twin = self.labelled(identify_memory(name))
-        object.__setattr__(twin, "name", name)
-        return twin
+        named_copy = self.labelled(identify_memory(name))
+        object.__setattr__(named_copy, "name", name)
+        return named_copy
 
 
 class MarkovChain(AbstractMemory):
@@ -148,6 +148,7 @@ class MarkovChain(AbstractMemory):
         name: str | None = None,
         radius: "Float[ArrayLike, '*modes']" = 0.0,
     ):
+        """Hold transition matrix, initial law (None: stationary), name, and the probabilities' largest errors."""
         report_domain("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, ("modes", "modes"))
         if rows.shape[0] != rows.shape[1] or not rows.size:
@@ -237,6 +238,7 @@ class Autoregression(AbstractMemory):
     identity: str = eqx.field(static=True)
 
     def __init__(self, correlation: "Float[ArrayLike, '']", name: str | None = None):
+        """Hold the correlation rho of successive values and the name under which links share the memory."""
         self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
         self.name, self.identity = name, identify_memory(name)
 
@@ -262,9 +264,10 @@ class Autoregression(AbstractMemory):
         the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
         this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
         """
-        x, w, hermite = _hermite_quadrature(check_count("degree", degree, 0) + 1)
-        powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
-        return MemoryStates(x, w, (hermite * powers) @ hermite.T * w)
+        x, w, hermite = _hermite_quadrature(check_count("degree", degree, least=0) + 1)
+        powers_of_rho = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
+        transition = (hermite * powers_of_rho) @ hermite.T * w
+        return MemoryStates(x, w, transition)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
         """Return the number itself: the state is a real number."""
@@ -277,7 +280,9 @@ class Autoregression(AbstractMemory):
         """
         x, w, _ = _hermite_quadrature(degree + 1)
         rho = jnp.asarray(self.correlation)
-        return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
+        if state is None:
+            return jnp.asarray(x), w
+        return rho * state + jnp.sqrt(1 - rho**2) * x, w
 
     def chain(self, modes: int) -> MemoryStates:
         """Return a chain with the same mean, variance and correlation, without negative entries.
@@ -287,16 +292,16 @@ class Autoregression(AbstractMemory):
 
         Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
         """
-        n = check_count("modes of a fading", modes, 2) - 1
+        n = check_count("modes of a fading", modes, least=2) - 1
         xp = library(self.correlation)
         stays = (1 + xp.asarray(self.correlation)) / 2
-        rows = [
-            xp.convolve(_compute_binomial_probabilities(i, stays), _compute_binomial_probabilities(n - i, 1 - stays))
-            for i in range(n + 1)
-        ]
-        return MemoryStates(
-            np.sqrt(n) * np.linspace(-1, 1, n + 1), _compute_binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows)
-        )
+        rows = []
+        for heads in range(n + 1):
+            stay_heads = _compute_binomial_probabilities(heads, stays)
+            become_heads = _compute_binomial_probabilities(n - heads, 1 - stays)
+            rows.append(xp.convolve(stay_heads, become_heads))  # the law of the sum of both numbers
+        states = np.sqrt(n) * np.linspace(-1, 1, n + 1)
+        return MemoryStates(states, _compute_binomial_probabilities(n, np.asarray(0.5)), xp.stack(rows))
 
 
 def find_stationary_law(transition: Rows) -> Law:
@@ -308,7 +313,8 @@ def find_stationary_law(transition: Rows) -> Law:
     # p (Pi - I) = 0, of which one row follows from the others; in its place the sum of p is 1.
     balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
     law = xp.linalg.solve(balance, np.eye(m)[-1])
-    normalised: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
+    law = xp.maximum(law, 0.0)
+    normalised: Law = law / law.sum()
     return normalised
 
 
@@ -322,9 +328,9 @@ def identify_memory(name: str | None) -> str:
 def _compute_binomial_probabilities(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
     """Return the probabilities (n + 1,) of 0, ..., n successes in n trials, each with the probability p."""
     k = np.arange(n + 1)
-    ways = np.array([comb(n, i) for i in k], dtype=float)
-    binomial: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
-    return binomial
+    coefficients = np.array([comb(n, i) for i in k], dtype=float)
+    probabilities: jax.Array | np.ndarray = coefficients * p**k * (1 - p) ** (n - k)
+    return probabilities
 
 
 @cache_arrays
@@ -338,15 +344,19 @@ def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale
 
 
-def unique_memories(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
+def unique_memories(all_memories: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
     """Return the memories by identity, each once, in order of appearance.
 
     Raises:
         ValueError: memories of one identity (of one name) that differ.
     """
-    results: dict[str, AbstractMemory] = {}
-    for memory in held:
-        known = results.setdefault(memory.identity, memory)
-        if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
-            raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
-    return results
+    by_identity: dict[str, AbstractMemory] = {}
+    for memory in all_memories:
+        first_of_identity = by_identity.setdefault(memory.identity, memory)
+        if not (
+            first_of_identity is memory
+            or is_traced(first_of_identity, memory)
+            or eqx.tree_equal(first_of_identity, memory)
+        ):
+            raise fail(f"memory {first_of_identity.name!r}", "one transition and one initial law", "several")
+    return by_identity

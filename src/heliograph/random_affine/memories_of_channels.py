@@ -26,9 +26,9 @@ class AbstractWithMemory(Module):
 
 
 def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T | None:
-    """Return the model of a mode, with its numbers, of models (one a mode) that differ in numbers alone; else None.
+    """Return the model of mode `state` out of `models`, one a mode, with its numbers; None if they differ in structure.
 
-    `state`: the number of the mode, which is traced by JAX, so that no model can be chosen by it: its numbers are.
+    `state` is traced by JAX, so that no object can be chosen by it: each number is chosen among those of all models.
     """
     leaves, trees = zip(*(jax.tree.flatten(model) for model in models), strict=True)
     if any(not eqx.is_array_like(leaf) for of_mode in leaves for leaf in of_mode):
@@ -36,8 +36,8 @@ def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T 
     shapes = {tuple(np.shape(leaf) for leaf in of_mode) for of_mode in leaves}
     if len(set(trees)) > 1 or len(shapes) > 1:
         return None
-    numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
-    present: T = jax.tree.unflatten(trees[0], numbers)
+    leaves_by_place = [jnp.stack([jnp.asarray(leaf) for leaf in of_modes]) for of_modes in zip(*leaves, strict=True)]
+    present: T = jax.tree.unflatten(trees[0], [of_modes[state] for of_modes in leaves_by_place])
     return present
 
 
@@ -59,11 +59,12 @@ def draw_with_shared_memories(
 ) -> tuple[ChannelState, jax.Array]:
     """Draw H by `key` given the memories' states, and move each memory by one of `keys`; return the new state and H.
 
-    The state: those of all memories in a channel, and the `rest`, that of the channel given these.
+    The state: those of all memories in a channel, and the `rest_of_channel`, that of the channel given these.
     """
-    rest, h = condition_on_memories(channel, state.memories).draw(state.rest, key)
-    held = memories(channel).values()
-    return ChannelState(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
+    rest_of_channel, matrix = condition_on_memories(channel, state.memories).draw(state.rest, key)
+    triples = zip(memories(channel).values(), state.memories, keys, strict=True)
+    next_memories = tuple(memory.move(memory_state, memory_key) for memory, memory_state, memory_key in triples)
+    return ChannelState(next_memories, rest_of_channel), matrix
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
@@ -107,9 +108,9 @@ def number_unnamed_memories(model: T) -> T:
 
     So models that differ in these texts alone look alike.
     """
-    held = enumerate(memories(model).items())
-    twins = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in held if memory.name is None}
-    return replace_memories(model, twins)
+    numbered = enumerate(memories(model).items())
+    labelled = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in numbered if memory.name is None}
+    return replace_memories(model, labelled)
 
 
 def separate_memories(maps: Sequence[T]) -> list[T]:
@@ -117,13 +118,16 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
     Named memories stay shared. The first map keeps its memories; later ones get copies, labelled by their index.
     """
-    separate, taken = [], set[str]()
+    separated, used_identities = [], set[str]()
     for index, affine in enumerate(maps):
-        held = memories(affine)
-        twins = {key: m.labelled(f"{key} of {index}") for key, m in held.items() if m.name is None and key in taken}
-        separate.append(replace_memories(affine, twins))
-        taken |= set(held)
-    return separate
+        memories_of_map = memories(affine)
+        shared = {
+            key: memory for key, memory in memories_of_map.items() if memory.name is None and key in used_identities
+        }
+        labelled = {key: memory.labelled(f"{key} of {index}") for key, memory in shared.items()}
+        separated.append(replace_memories(affine, labelled))
+        used_identities |= set(memories_of_map)
+    return separated
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
@@ -131,24 +135,28 @@ def align_memories_over_time(maps: Sequence[T]) -> list[T]:
 
     So they go on from step to step. Maps as they are where the first has no memory, or steps have different counts.
     """
-    by_map = [memories(affine) for affine in maps]
-    if not by_map[0] or len({len(held) for held in by_map}) > 1:
+    memories_by_map = [memories(affine) for affine in maps]
+    if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:
         return list(maps)
-    labels = [
-        {key: m.labelled(label) for (key, m), label in zip(held.items(), by_map[0], strict=True) if m.name is None}
-        for held in by_map
-    ]
-    return [replace_memories(affine, twins) for affine, twins in zip(maps, labels, strict=True)]
+    aligned = []
+    for affine, memories_of_map in zip(maps, memories_by_map, strict=True):
+        labelled = {
+            key: memory.labelled(label)
+            for (key, memory), label in zip(memories_of_map.items(), memories_by_map[0], strict=True)
+            if memory.name is None
+        }
+        aligned.append(replace_memories(affine, labelled))
+    return aligned
 
 
-def replace_memories(channel: T, twins: Mapping[str, AbstractMemory]) -> T:
-    """Return the map with other memories in place of its own; `twins`: the other memory by the identity of its own."""
+def replace_memories(channel: T, replacements: Mapping[str, AbstractMemory]) -> T:
+    """Return the map with other memories in place of its own; `replacements`: the other by the identity of its own."""
 
     def replace(leaf: PyTree) -> PyTree:
-        """Return a map with the other memory (`twins`, by identity) in place of its own, anything else as it is."""
-        if not is_memory_dependent(leaf) or leaf.memory.identity not in twins:
+        """Return a map with the other memory in place of its own, anything else as it is."""
+        if not is_memory_dependent(leaf) or leaf.memory.identity not in replacements:
             return leaf
-        return eqx.tree_at(lambda m: m.memory, leaf, twins[leaf.memory.identity])
+        return eqx.tree_at(lambda m: m.memory, leaf, replacements[leaf.memory.identity])
 
-    exchanged: T = jax.tree.map(replace, channel, is_leaf=is_memory_dependent) if twins else channel
-    return exchanged
+    replaced: T = jax.tree.map(replace, channel, is_leaf=is_memory_dependent) if replacements else channel
+    return replaced

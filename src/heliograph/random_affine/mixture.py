@@ -40,6 +40,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         weights: "Float[ArrayLike, ' maps']",
         radius: "Float[ArrayLike, '*maps']" = 0.0,
     ):
+        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`."""
         self.maps = check_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         self.check_shapes("mixture")
@@ -47,42 +48,46 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw every map, and which of them is in force; all states move. Returns the next state and H."""
         choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
-        state, drawn = self._draw_each(state, keys)
-        return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
+        state, matrices = self._draw_each(state, keys)
+        chosen = self.choice.sample(choice_key).astype(int)
+        return state, jnp.stack(matrices)[chosen]
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
         """Return sum_i p_i E[Sym^order(H_i)], p_i the probability of map i."""
         check_forgets("moments of a map", self)
-        parts = [m.moments(order).matrix for m in self.maps]
-        matrix = library(parts, self.choice.probabilities).tensordot(
-            self.choice.probabilities, stack_parts(parts), axes=1
-        )
-        return JointMoments(matrix, self.outputs, self.inputs, order)
+        matrices = [affine.moments(order).matrix for affine in self.maps]
+        probabilities = self.choice.probabilities
+        mean = library(matrices, probabilities).tensordot(probabilities, stack_parts(matrices), axes=1)
+        return JointMoments(mean, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return mixtures of the extreme weights with the extreme laws of each map: the law is linear in either.
-
-        So every law that is possible lies between these.
-        """
-        # The extreme laws of the choice, all of which are Discrete.
-        corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
+        """Return the mixtures of each extreme law of the choice with each combination of the maps' extremes."""
+        extreme_choices = [law for law in self.choice.extremes() if isinstance(law, Discrete)]  # all of them are
         return tuple(
-            Mixture(parts, law.probabilities)
-            for law in corners
-            for parts in product(*(m.extremes() for m in self.maps))
+            Mixture(extreme_maps, law.probabilities)
+            for law in extreme_choices
+            for extreme_maps in product(*(affine.extremes() for affine in self.maps))
         )
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] at each corner: each extreme law of the weights with each combination of the maps'."""
-        parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
-        chosen = np.array(list(product(*(range(len(corners)) for corners in parts)))).T
-        combined = stack_parts([corners[which] for corners, which in zip(parts, chosen, strict=True)])
+        """Return E[Sym^order(H)] at each corner: each extreme law of the weights with each combination of the maps'.
+
+        `weights` (corner, map): the extreme laws of the choice. `corner_numbers` (map, combination): one corner of
+        each map.
+        """
+        corners_by_map = [affine.corner_moments(order) for affine in self.maps]
+        weights = self.choice.corners()
+        numbers_by_map = [range(len(corners_of_map)) for corners_of_map in corners_by_map]
+        corner_numbers = np.array(list(product(*numbers_by_map))).T
+        combined = stack_parts(
+            [corners_of_map[numbers] for corners_of_map, numbers in zip(corners_by_map, corner_numbers, strict=True)]
+        )
         # By corner of the weights, combination, row and column; then by corner of the mixture, row and column.
-        items = library(weights, combined).tensordot(weights, combined, axes=1)
-        flat: Matrix = items.reshape(-1, *items.shape[2:])
-        return flat
+        moments = library(weights, combined).tensordot(weights, combined, axes=1)
+        by_corner: Matrix = moments.reshape(-1, *moments.shape[2:])
+        return by_corner
 
     def corner_count(self) -> int:
         """Return the extreme weights times the product of the maps' counts."""
@@ -104,10 +109,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     def in_words(self) -> str:
         """Return the maps in words, with their shares; a choice of a map or silence is a loss that nobody notices."""
-        parts, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
-        if len(parts) == 2 and parts[1] == NOTHING_SENT:
-            return f"{parts[0]}, {write_percentage(shares[1])} lost unnoticed"
-        choices = (f"{words} ({write_percentage(p)})" for words, p in zip(parts, shares, strict=True))
+        maps_in_words, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
+        if len(maps_in_words) == 2 and maps_in_words[1] == NOTHING_SENT:
+            return f"{maps_in_words[0]}, {write_percentage(shares[1])} lost unnoticed"
+        choices = (f"{words} ({write_percentage(p)})" for words, p in zip(maps_in_words, shares, strict=True))
         return f"({' or '.join(choices)})"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
@@ -125,7 +130,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Return z = E[G] y + n with the mean and covariance of the mixture's noise n, in place of the mixture."""
         moments = self.moments(2)
         mean = moments.mean
-        second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1
+        noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
+        second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
-        noise = Gaussian(second - offset[:, None] * offset, offset)
+        noise = Gaussian(second_moment - offset[:, None] * offset, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

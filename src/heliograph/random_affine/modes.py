@@ -50,6 +50,7 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
+        """Hold the Markov chain and one memoryless map for each of its modes."""
         if not isinstance(chain, MarkovChain):
             raise fail("chain", "a MarkovChain", show_value(chain))
         self.memory, self.maps = chain, check_maps("maps of the modes", maps)
@@ -73,7 +74,8 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         """Return whether `own` is possible under this map: of modes whose chain and maps are, one by one."""
         if not isinstance(own, Modes) or not self.memory.covers(own.memory) or len(own.maps) != len(self.maps):
             return False
-        return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
+        pairs = zip(self.maps, own.maps, strict=True)
+        return all(believed.covers(actual, same_noise) for believed, actual in pairs)
 
     def in_words(self) -> str:
         """Return the maps in words, and the name of the memory."""
@@ -149,9 +151,10 @@ class OneStepLate(AbstractMapWrapper):
 
         State: that of the map `base`, and the rows [G, n] that it drew last.
         """
-        inner, before = state
-        inner, h = self.base.draw(inner, key)
-        return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
+        base_state, rows_before = state
+        base_state, matrix = self.base.draw(base_state, key)
+        rows, last_row = matrix[:-1], matrix[-1:]  # [G, n] and [0, 1]
+        return (base_state, rows), jnp.concatenate([rows_before, last_row])
 
     def carry_angles(self, sent: Angles) -> Angles:
         """Return the angles of the map."""
@@ -191,10 +194,11 @@ class Faded(AbstractHop, AbstractModal):
         matrix: "Float[ArrayLike, 'm p']",
         noise: "AbstractNoise | Float[ArrayLike, '*m']",
     ):
+        """Hold the drift c, mean and deviation of the gain mean + deviation c, the matrix A and the noise's law."""
         if not isinstance(drift, Autoregression):
             raise fail("drift", "an Autoregression", show_value(drift))
         self.memory, self.mean = drift, scalar("mean gain", mean)
-        self.deviation = scalar("deviation of the gain", deviation, 0.0)
+        self.deviation = scalar("deviation of the gain", deviation, low=0.0)
         self.matrix = array("gain matrix", matrix, ("outputs", "inputs"))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
@@ -319,19 +323,19 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
     p: `initial`; Pi: `chain`, the transitions; n = 2^DOUBLINGS. Staying with probability 1/2 ends circles and keeps the
     mean.
     """
-    rows = (np.eye(len(chain)) + chain) / 2
+    transition = (np.eye(len(chain)) + chain) / 2
     for _ in range(DOUBLINGS):
-        rows = rows @ rows  # n doubles
-        rows = rows / rows.sum(axis=1, keepdims=True)
-    return np.asarray(initial @ rows)
+        transition = transition @ transition  # n doubles
+        transition = transition / transition.sum(axis=1, keepdims=True)
+    return np.asarray(initial @ transition)
 
 
 def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
     """Return the probabilities of the modes at each step, from the first law and each step's transitions."""
-    over_steps = [np.asarray(steps[0].initial)]
+    laws = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
-        over_steps.append(over_steps[-1] @ np.asarray(step.transition))
-    return over_steps
+        laws.append(laws[-1] @ np.asarray(step.transition))
+    return laws
 
 
 def is_memory_irrelevant_for_linear_filter(steps: Sequence[JointModes], constant: bool) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache, singledispatch
+from itertools import islice
 
 import equinox as eqx
 import jax
@@ -24,7 +25,7 @@ from heliograph.random_affine.moments.mixture_components import (
     combine_atoms,
     stack_branches,
 )
-from heliograph.random_affine.moments.monomials import Exponents, list_exponents
+from heliograph.random_affine.moments.monomials import Exponents, list_exponents, multiply_by_linear_form
 
 LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
 FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
@@ -121,6 +122,7 @@ class Gaussian(AbstractNoise):
     weights: Vector
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
+        """Hold covariance and mean, and a square root of the covariance: factor diag(weights) factor'."""
         self.covariance = check.covariance("noise covariance", covariance)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
@@ -146,32 +148,33 @@ class Gaussian(AbstractNoise):
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
         """Return the noise of each group of components, or None where two groups are correlated."""
-        label = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        if np.any(np.asarray(self.covariance)[label[:, None] != label]):
+        group_of_component = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        are_apart = group_of_component[:, None] != group_of_component
+        if np.any(np.asarray(self.covariance)[are_apart]):
             return None
-        blocks = [np.ix_(group, group) for group in groups]
-        return [Gaussian(self.covariance[block], self.mean[block[0][:, 0]]) for block in blocks]
+        return [Gaussian(self.covariance[np.ix_(group, group)], self.mean[np.asarray(group)]) for group in groups]
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw mean + A e with e normal of variances w."""
-        draw = jax.random.normal(key, self.mean.shape, dtype=float)
-        return jnp.asarray(self.mean + self.factor @ (square_root(jnp.asarray(self.weights)) * draw))
+        e = square_root(jnp.asarray(self.weights)) * jax.random.normal(key, self.mean.shape, dtype=float)
+        return jnp.asarray(self.mean + self.factor @ e)
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""
 
         @cache
         def expectation(a: Exponents) -> Number:
-            """Return E[n^a] of Gaussian n: with n^a = n_i g(n) it is m_i E[g] + sum_j S_ij E[dg/dn_j]."""
+            """Return E[n^a] = E[n_i g(n)] for the first i with a_i > 0: m_i E[g] + sum_j S_ij E[dg/dn_j]."""
             if sum(a) == 0:
                 return 1.0
             i = next(index for index, power in enumerate(a) if power)
-            rest = (*a[:i], a[i] - 1, *a[i + 1 :])
-            total = plain(self.mean[i]) * expectation(rest)
-            for j, power in enumerate(rest):
+            exponents_of_g = (*a[:i], a[i] - 1, *a[i + 1 :])
+            total = plain(self.mean[i]) * expectation(exponents_of_g)
+            for j, power in enumerate(exponents_of_g):
                 if power and not is_zero(self.covariance[i, j]):
-                    lower = (*rest[:j], power - 1, *rest[j + 1 :])
-                    total += plain(self.covariance[i, j]) * power * expectation(lower)
+                    # dg/dn_j is `power` times the monomial of one power of n_j less.
+                    lowered = (*exponents_of_g[:j], power - 1, *exponents_of_g[j + 1 :])
+                    total += plain(self.covariance[i, j]) * power * expectation(lowered)
             return total
 
         return expectation(tuple(powers))
@@ -213,16 +216,17 @@ class FiniteSupport(AbstractNoise):
     covariance: Square
 
     def __init__(self, atoms: "Float[ArrayLike, 'atom component']", probabilities: "Float[ArrayLike, ' atom']"):
+        """Hold the values and their probabilities; mean and covariance follow."""
         self.atoms = array("noise atoms", atoms, ("atoms", "components"))
         self.probabilities = check.probabilities("noise probabilities", probabilities, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
-        centred = self.atoms - self.mean
-        self.covariance = centred.T @ (self.probabilities[:, None] * centred)
+        deviations = self.atoms - self.mean
+        self.covariance = deviations.T @ (self.probabilities[:, None] * deviations)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Return the values, each without a spread about it."""
-        none = np.zeros((self.dimension, self.dimension))
-        return [NoiseAtom(plain(p), v, none) for p, v in zip(self.probabilities, self.atoms, strict=True)]
+        """Return the values with their probabilities, each a point: of covariance 0 about it."""
+        zero = np.zeros((self.dimension, self.dimension))
+        return [NoiseAtom(plain(p), value, zero) for p, value in zip(self.probabilities, self.atoms, strict=True)]
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one of the values, by inverting the distribution function at a uniform draw."""
@@ -241,22 +245,22 @@ class Independent(AbstractNoise):
     covariance: Square
 
     def __init__(self, parts: Sequence[AbstractNoise]):
+        """Hold the independent noises; their means are concatenated, their covariances are the diagonal blocks."""
         self.parts = tuple(items("independent noises", parts, "laws"))
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
-        for component in self.parts:
-            if not isinstance(component, AbstractNoise):
-                raise fail("independent noises", "laws of a noise vector", show_value(component))
-        means, blocks = [component.mean for component in self.parts], [component.covariance for component in self.parts]
+        if no_noises := [noise for noise in self.parts if not isinstance(noise, AbstractNoise)]:
+            raise fail("independent noises", "laws of a noise vector", show_value(no_noises[0]))
+        means, covariances = [noise.mean for noise in self.parts], [noise.covariance for noise in self.parts]
         self.mean = library(means).concatenate(means)
-        self.covariance = block_diagonal(blocks)
+        self.covariance = block_diagonal(covariances)
 
     @property
     def columns(self) -> WeightedColumns:
         """Columns A and weights w with covariance A diag(w) A': those of the parts, one after another."""
-        parts = [component.columns for component in self.parts]
-        matrices = [part.matrix for part in parts]
-        weights = library(parts).concatenate([part.weights for part in parts])
+        columns_by_noise = [noise.columns for noise in self.parts]
+        matrices = [columns.matrix for columns in columns_by_noise]
+        weights = library(columns_by_noise).concatenate([columns.weights for columns in columns_by_noise])
         return WeightedColumns(block_diagonal(matrices), weights)
 
     @property
@@ -275,20 +279,23 @@ class Independent(AbstractNoise):
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return mean and covariance of the independent parts without their outliers, one above the other."""
-        parts = [component.without_outliers() for component in self.parts]
-        mean = library(parts).concatenate([part.mean for part in parts])
-        return NoiseWithoutOutliers(mean, block_diagonal([part.covariance for part in parts]))
+        inliers = [noise.without_outliers() for noise in self.parts]
+        mean = library(inliers).concatenate([inlier.mean for inlier in inliers])
+        return NoiseWithoutOutliers(mean, block_diagonal([inlier.covariance for inlier in inliers]))
 
     def list_atoms(self) -> list[NoiseAtom]:
         """Return every atom of each part with every one of the others."""
         return combine_atoms([component.list_atoms() for component in self.parts], NoiseAtom.above)
 
     def _split(self, groups: Sequence[Sequence[int]]) -> list[AbstractNoise] | None:
-        """Return the noise of each group of components, of the parts that it takes; None where one is of two groups."""
-        owners = np.repeat(np.arange(len(self.parts)), [component.dimension for component in self.parts])
-        owned = [[self.parts[i] for i in dict.fromkeys(owners[list(group)].tolist())] for group in groups]
-        apart = [sum(part.dimension for part in parts) for parts in owned] == [len(group) for group in groups]
-        return [Independent(parts) for parts in owned] if apart else None
+        """Return the noise of each group of components, of the noises it takes; None where one is of two groups."""
+        # Which noise each component belongs to, and the noises that have a component in each group.
+        noise_of_component = np.repeat(np.arange(len(self.parts)), [noise.dimension for noise in self.parts])
+        numbers_by_group = [dict.fromkeys(noise_of_component[list(group)].tolist()) for group in groups]
+        noises_by_group = [[self.parts[i] for i in numbers] for numbers in numbers_by_group]
+        dimensions = [sum(noise.dimension for noise in noises) for noises in noises_by_group]
+        are_whole = dimensions == [len(group) for group in groups]
+        return [Independent(noises) for noises in noises_by_group] if are_whole else None
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
@@ -296,20 +303,19 @@ class Independent(AbstractNoise):
         return jnp.concatenate([component.sample(k) for component, k in zip(self.parts, keys, strict=True)])
 
     def report(self, y: jax.Array) -> jax.Array:
-        """Return what each part reports (as rounded values) of its components of a measurement y."""
-        ends = np.cumsum([component.dimension for component in self.parts])[:-1]
-        pieces = zip(self.parts, jnp.split(y, ends), strict=True)
-        return jnp.concatenate([component.report(piece) for component, piece in pieces])
+        """Return what each noise's own part of a measurement y is reported as, such as rounded values."""
+        ends = np.cumsum([noise.dimension for noise in self.parts])[:-1]
+        pairs = zip(self.parts, jnp.split(y, ends), strict=True)
+        return jnp.concatenate([noise.report(y_of_noise) for noise, y_of_noise in pairs])
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a], the product of E[n_part^a_part] over the independent parts; `powers`: a, by component."""
-        value: Number = 1.0
-        start = 0
-        for component in self.parts:
-            component_powers = tuple(powers[start : start + component.dimension])
-            start += component.dimension
-            value *= component.moment(component_powers) if any(component_powers) else 1.0
-        return value
+        """Return E[n^a], the product of E[n_j^a_j] over the independent noises n_j; `powers`: a, by component."""
+        product: Number = 1.0
+        next_powers = iter(powers)
+        for noise in self.parts:
+            exponents = tuple(islice(next_powers, noise.dimension))
+            product *= noise.moment(exponents) if any(exponents) else 1.0
+        return product
 
 
 class Shaped(AbstractNoise):
@@ -326,6 +332,7 @@ class Shaped(AbstractNoise):
     covariance: Square
 
     def __init__(self, matrix: "Float[ArrayLike, 'dimension source']", source: AbstractNoise):
+        """Hold B and the law of u; mean and covariance are B E[u] and B Cov[u] B'."""
         instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
         self.matrix = array("noise matrix", matrix, (None, source.dimension))
         self.source = source
@@ -351,20 +358,9 @@ class Shaped(AbstractNoise):
         polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
         for i, power in enumerate(powers):
             for _ in range(power):
-                polynomial = _multiply_by_linear(polynomial, self.matrix[i])
+                polynomial = multiply_by_linear_form(polynomial, self.matrix[i])
         moment = self.source.moment
-        return sum(c * (moment(a) if any(a) else 1.0) for a, c in polynomial.items())
-
-
-def _multiply_by_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
-    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
-    product: dict[Exponents, Number] = {}
-    used = [j for j, entry in enumerate(row) if not is_zero(entry)]
-    for a, c in polynomial.items():
-        for j in used:
-            raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            product[raised] = product.get(raised, 0.0) + c * plain(row[j])
-    return product
+        return sum(coefficient * (moment(a) if any(a) else 1.0) for a, coefficient in polynomial.items())
 
 
 NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a covariance, or a variance

@@ -43,8 +43,9 @@ class StudentT(AbstractNoise):
     mean: Vector
 
     def __init__(self, scale: ArrayLike, degrees: ArrayLike):
+        """Hold the scale matrix and the degrees of freedom nu; the mean is zero."""
         self.scale = check.covariance("scale of Student's law", scale, _size_of_number(scale))
-        self.degrees = scalar("degrees of Student's law", degrees, TINY)
+        self.degrees = scalar("degrees of Student's law", degrees, low=TINY)
         self.mean = np.zeros(self.scale.shape[-1])
 
     @property  # type: ignore[misc]
@@ -58,8 +59,8 @@ class StudentT(AbstractNoise):
         if not is_traced(nu) and nu <= 2:
             expected = "more than 2, below which it has no covariance (robust_filter with its score update needs none)"
             raise fail("degrees of Student's law", expected, f"{float(nu):g}")
-        total: Square = self.scale * (nu / (nu - 2))
-        return total
+        covariance: Square = self.scale * (nu / (nu - 2))
+        return covariance
 
     @property
     def has_outliers(self) -> bool:
@@ -78,8 +79,9 @@ class StudentT(AbstractNoise):
         """
         xp, n = library(self.degrees, self.scale), self.dimension
         shape = (n, len(PRECISIONS))
-        shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
-        return GaussianBranches(shares, np.zeros(shape), xp.diagonal(self.scale)[:, None] / PRECISIONS)
+        log_shares = xp.broadcast_to(_log_or_minus_infinity(gamma_mass_of_precisions(self.degrees)), shape)
+        variances = xp.diagonal(self.scale)[:, None] / PRECISIONS
+        return GaussianBranches(log_shares, np.zeros(shape), variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the Gaussian noise of the scale."""
@@ -87,10 +89,10 @@ class StudentT(AbstractNoise):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw Gaussian noise of the scale divided by sqrt(l), l of the gamma law of mean 1: Student's noise."""
-        first, second = jax.random.split(key)
+        noise_key, precision_key = jax.random.split(key)
         half = jnp.asarray(self.degrees, dtype=float) / 2
-        precision = jax.random.gamma(second, half, dtype=float) / half
-        return Gaussian(self.scale).sample(first) / jnp.sqrt(precision)
+        precision = jax.random.gamma(precision_key, half, dtype=float) / half
+        return Gaussian(self.scale).sample(noise_key) / jnp.sqrt(precision)
 
     def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] = E[l^(-k)] times the Gaussian moment, k = |a| / 2 and E[l^(-k)] = prod_i nu / (nu - 2 i).
@@ -105,9 +107,8 @@ class StudentT(AbstractNoise):
             return 0.0
         if not is_traced(nu) and 0 < nu <= order:
             raise fail(f"degrees of Student's law in moments of order {order}", f"more than {order}", f"{float(nu):g}")
-        return prod((plain(nu / (nu - 2 * i)) for i in range(1, order // 2 + 1)), start=1.0) * Gaussian(
-            self.scale
-        ).moment(powers)
+        inverse_precision_moment = prod((plain(nu / (nu - 2 * i)) for i in range(1, order // 2 + 1)), start=1.0)
+        return inverse_precision_moment * Gaussian(self.scale).moment(powers)
 
 
 class Contaminated(AbstractNoise):
@@ -135,6 +136,7 @@ class Contaminated(AbstractNoise):
     bounded: bool = eqx.field(static=True)
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
+        """Hold shares, means and covariances of the mixture: noise without outliers first, then the outliers."""
         # Shares, covariances and biases of the kinds of outliers, one each.
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
@@ -171,13 +173,18 @@ class Contaminated(AbstractNoise):
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
         factor = array("mean of the exponential bias", mean, (n,) if rank("mean", mean) else ())
-        center, variance = _slice_exponential(count)
+        slice_means, slice_variances = _slice_exponential(count)
         xp = library(factor, inlier, share)
-        units = xp.broadcast_to(factor, (n,))
-        slice_share = scalar("share of outliers", share, 0.0, 1.0) / count
-        # A slice adds its mean to the noise, and its variance along `units` to the covariance.
-        spreads = [inlier + v * xp.outer(units, units) for v in variance]
-        return cls(inlier, xp.stack([slice_share] * count), xp.stack(spreads), xp.stack([m * units for m in center]))
+        direction = xp.broadcast_to(factor, (n,))
+        slice_share = scalar("share of outliers", share, low=0.0, high=1.0) / count
+        # A slice adds its mean to the noise, and its variance along `direction` to the covariance.
+        covariances = [inlier + v * xp.outer(direction, direction) for v in slice_variances]
+        return cls(
+            inlier,
+            xp.stack([slice_share] * count),
+            xp.stack(covariances),
+            xp.stack([m * direction for m in slice_means]),
+        )
 
     @classmethod
     def at_most(cls, covariance: ArrayLike, share: ArrayLike, outlier_second_moment: ArrayLike) -> "Contaminated":
@@ -191,10 +198,10 @@ class Contaminated(AbstractNoise):
         """
         law = cls(covariance, share, outlier_second_moment)
         if not is_traced(law.covariances):
-            least = np.min(np.linalg.eigvalsh(law.covariances[1] - law.covariances[0]))
-            if least < -1e-10 * np.max(np.abs(law.covariances[1])):
+            smallest = np.min(np.linalg.eigvalsh(law.covariances[1] - law.covariances[0]))
+            if smallest < -1e-10 * np.max(np.abs(law.covariances[1])):
                 raise fail("second moment of the outliers", "one that is at least the covariance of the others",
-                           f"a difference with eigenvalue {least:.3g}")  # fmt: skip
+                           f"a difference with eigenvalue {smallest:.3g}")  # fmt: skip
         object.__setattr__(law, "bounded", True)
         return law
 
@@ -214,9 +221,10 @@ class Contaminated(AbstractNoise):
         By component and branch: logarithm of the probability, mean and variance.
         """
         xp, n = library(self.shares), self.dimension
-        shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
+        log_shares = xp.broadcast_to(_log_or_minus_infinity(self.shares), (n, len(self.shares)))
         variances = xp.diagonal(self.covariances, axis1=1, axis2=2).T
-        return GaussianBranches(shares, (self.means - self.mean).T, variances)
+        means = (self.means - self.mean).T
+        return GaussianBranches(log_shares, means, variances)
 
     def without_outliers(self) -> NoiseWithoutOutliers:
         """Return the mean and covariance of the first branch: the noise without outliers."""
@@ -224,10 +232,11 @@ class Contaminated(AbstractNoise):
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the branch, without or with outliers, by the shares; return the noise of its Gaussian law."""
-        first, second = jax.random.split(key)
-        branch = draw_index(self.shares, first)
-        laws = [Gaussian(r, m) for r, m in zip(self.covariances, self.means, strict=True)]
-        return jnp.stack([law.sample(second) for law in laws])[branch]
+        branch_key, noise_key = jax.random.split(key)
+        branch = draw_index(self.shares, branch_key)
+        laws = [Gaussian(covariance, mean) for covariance, mean in zip(self.covariances, self.means, strict=True)]
+        samples = jnp.stack([law.sample(noise_key) for law in laws])
+        return samples[branch]
 
     def moment(self, powers: Exponents) -> Number:
         """Return the mean of the branches' moments."""
@@ -242,10 +251,10 @@ def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
     between the geometric means of neighbouring PRECISIONS.
     """
     xp: Any = library(degrees)
-    half = xp.asarray(degrees) / 2
-    between = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
-    below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half, between.shape), between * half)
-    masses = xp.diff(xp.concatenate([np.zeros(1), below, np.ones(1)]))
+    half_degrees = xp.asarray(degrees) / 2
+    edges = np.sqrt(PRECISIONS[1:] * PRECISIONS[:-1])
+    mass_below = scipy_for(degrees).special.gammainc(xp.broadcast_to(half_degrees, edges.shape), edges * half_degrees)
+    masses = xp.diff(xp.concatenate([np.zeros(1), mass_below, np.ones(1)]))
     masses = xp.maximum(masses, LEAST_SHARE)
     shares: Vector = masses / xp.sum(masses)
     return shares
@@ -272,12 +281,13 @@ def _size_of_number(value: ArrayLike) -> int | None:
 def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
     """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
     if not rank("share of outliers", share):
-        return [scalar("share of outliers", share, 0.0, 1.0)], False
+        return [scalar("share of outliers", share, low=0.0, high=1.0)], False
     values = array("shares of outliers", share, ("kinds",))
     if not len(values):
         raise fail("shares of outliers", "at least one", "none")
-    total = sum(scalar("share of outliers", value, 0.0, 1.0) for value in values)
-    scalar("sum of the shares of outliers", total, 0.0, 1.0 + 1e-12) if not is_traced(total) else None
+    total = sum(scalar("share of outliers", value, low=0.0, high=1.0) for value in values)
+    if not is_traced(total):
+        scalar("sum of the shares of outliers", total, low=0.0, high=1.0 + 1e-12)  # raises where it is above 1
     return list(values), True
 
 
@@ -290,10 +300,10 @@ def _read_matrices(name: str, value: ArrayLike, count: int, several: bool) -> li
         return [value]
     if not rank(name, value):
         return [value] * count
-    parts: list[ArrayLike] = list(cast(Sequence[ArrayLike], value))
-    if len(parts) != count:
-        raise fail(name, f"one for each of the {count} shares", len(parts))
-    return parts
+    values: list[ArrayLike] = list(cast(Sequence[ArrayLike], value))
+    if len(values) != count:
+        raise fail(name, f"one for each of the {count} shares", len(values))
+    return values
 
 
 def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -303,9 +313,9 @@ def _slice_exponential(count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     survival = 1 - np.arange(count + 1) / count  # at the slices' ends; at 0 the logarithm is multiplied by 0
     time = -np.log(np.where(survival > 0, survival, 1.0))
-    first = count * -np.diff(survival * (time + 1))
-    second = count * -np.diff(survival * (time**2 + 2 * time + 2))
-    return first, second - first**2
+    mean = count * -np.diff(survival * (time + 1))
+    mean_square = count * -np.diff(survival * (time**2 + 2 * time + 2))
+    return mean, mean_square - mean**2
 
 
 def _log_or_minus_infinity(value: Vector) -> Vector:

@@ -33,7 +33,8 @@ class Rotation(AbstractRandomAffine):
     deviation: Float[jax.Array | np.ndarray, ""]
 
     def __init__(self, deviation: "Float[ArrayLike, '']"):
-        self.deviation = scalar("deviation of a phase", deviation, 0.0)
+        """Hold the standard deviation of the phase in rad."""
+        self.deviation = scalar("deviation of a phase", deviation, low=0.0)
 
     @property
     def outputs(self) -> int:
@@ -49,7 +50,8 @@ class Rotation(AbstractRandomAffine):
         """Draw H = [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]] of a random angle phi, normal of this deviation."""
         phi = self.deviation * jax.random.normal(key, dtype=float)
         c, s = jnp.cos(phi), jnp.sin(phi)
-        return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
+        zero = 0 * c
+        return jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.array([0.0, 0.0, 1.0])])
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
@@ -60,9 +62,10 @@ class Rotation(AbstractRandomAffine):
         """
         turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)
-        there, back = (symmetric_power(matrix, order) for matrix in (TO_COMPLEX, np.linalg.inv(TO_COMPLEX)))
-        matrix = (np.asarray(back) * factors) @ there
-        return JointMoments(matrix.real, 2, 2, order)
+        to_complex = symmetric_power(TO_COMPLEX, order)
+        from_complex = symmetric_power(np.linalg.inv(TO_COMPLEX), order)
+        matrix = (np.asarray(from_complex) * factors) @ to_complex
+        return JointMoments(matrix.real, outputs=2, inputs=2, order=order)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the map as it is, and the place as it was: it has no transmitter."""

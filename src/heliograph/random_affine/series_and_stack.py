@@ -69,7 +69,8 @@ class AbstractCombination(AbstractComposite):
         """Decide whether another map is of this kind, and each of its maps is possible under that of this one."""
         if not isinstance(own, AbstractCombination) or type(own) is not type(self) or len(own.maps) != len(self.maps):
             return False
-        return all(x.covers(y, same_noise) for x, y in zip(self.maps, own.maps, strict=True))
+        pairs = zip(self.maps, own.maps, strict=True)
+        return all(believed.covers(actual, same_noise) for believed, actual in pairs)
 
     def _draw_each(
         self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
@@ -79,8 +80,9 @@ class AbstractCombination(AbstractComposite):
         The state is the tuple of the maps' states; () where all of them forget.
         """
         states = state if self.remembers else ((),) * len(self.maps)
-        pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
-        return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
+        draws = [affine.draw(map_state, key) for affine, map_state, key in zip(self.maps, states, keys, strict=True)]
+        next_states = tuple(map_state for map_state, _ in draws) if self.remembers else ()
+        return next_states, [matrix for _, matrix in draws]
 
 
 def _join_outcomes(
@@ -107,10 +109,13 @@ class Series(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        """Hold the maps in the order of their application; each takes as many inputs as the last has outputs."""
         self.maps = check_maps("series", maps)
-        for first, second in zip(self.maps, self.maps[1:], strict=False):
-            if first.outputs != second.inputs:
-                raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
+        for affine, next_affine in zip(self.maps, self.maps[1:], strict=False):
+            if affine.outputs != next_affine.inputs:
+                raise fail(
+                    "series", f"a map that takes {affine.outputs} inputs", f"one that takes {next_affine.inputs}"
+                )
 
     @property
     def outputs(self) -> int:
@@ -122,16 +127,18 @@ class Series(AbstractCombination):
 
         Rows of lost outputs are NaN.
         """
-        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
-        then = _compose_draws if self.erases else jnp.matmul
-        return state, reduce(lambda h, matrix: then(matrix, h), drawn)
+        state, matrices = self._draw_each(state, jax.random.split(key, len(self.maps)))
+        multiply = _compose_draws if self.erases else jnp.matmul
+        return state, reduce(lambda product, matrix: multiply(matrix, product), matrices)
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H)] of the series, k = `order`: E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
-        matrix = reduce(lambda done, affine: affine.moments(order).matrix @ done, self.maps[1:],
-                        self.maps[0].moments(order).matrix)  # fmt: skip
+        first_map, *later_maps = self.maps
+        matrix = first_map.moments(order).matrix
+        for affine in later_maps:
+            matrix = affine.moments(order).matrix @ matrix
         return JointMoments(matrix, self.outputs, self.inputs, order)
 
     @cache_by_object
@@ -140,11 +147,11 @@ class Series(AbstractCombination):
 
         A corner is an extreme law of those possible. Those of the first map vary slowest.
         """
-        first, *rest = (m.corner_moments(order) for m in self.maps)
-        for corners in rest:
-            products = corners @ first[:, None]
-            first = products.reshape(-1, *products.shape[2:])
-        return first
+        joint_corners, *corners_of_later_maps = (affine.corner_moments(order) for affine in self.maps)
+        for corners_of_map in corners_of_later_maps:
+            products = corners_of_map @ joint_corners[:, None]  # (corner before, corner, row, column)
+            joint_corners = products.reshape(-1, *products.shape[2:])
+        return joint_corners
 
     def _interval_of_parts(self, order: int) -> Interval:
         """Return the interval of E[Sym^order(H)]: the matrix product of the intervals of all maps."""
@@ -190,9 +197,9 @@ class Series(AbstractCombination):
 
     def detach_outliers(self) -> tuple[AbstractRandomAffine, AbstractNoise | None]:
         """Return the series without the noise of its last map where its law has outliers, and that noise; else None."""
-        *before, last = self.maps
-        plain, noise = last.detach_outliers()
-        return (self, None) if noise is None else (Series([*before, plain]), noise)
+        *earlier_maps, last_map = self.maps
+        last_without_noise, noise = last_map.detach_outliers()
+        return (self, None) if noise is None else (Series([*earlier_maps, last_without_noise]), noise)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the series with visit(name, hop, signal) in place of each hop, and the position behind it.
@@ -215,9 +222,10 @@ class Series(AbstractCombination):
 def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[AbstractRandomAffine, np.ndarray]:
     """Return y behind x, and which of its outputs arrive: those that use nothing that x lost."""
     received = known(np.diag(x.arrived.astype(float)))  # zero in place of what x lost
-    power = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
-    uses = np.einsum("iiaa->ia", power) > 0  # E[G_ia^2]
-    return Series([x.map, received, y.map]), y.arrived & ~uses[:, ~x.arrived].any(axis=1)
+    gain_moments = np.asarray(y.map.moments(2).second)[..., :-1, :-1]
+    uses = np.einsum("iiaa->ia", gain_moments) > 0  # E[G_ia^2]
+    uses_lost = uses[:, ~x.arrived].any(axis=1)
+    return Series([x.map, received, y.map]), y.arrived & ~uses_lost
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
@@ -225,9 +233,9 @@ def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
 
     An output of the second that has a gain on a lost one is lost too.
     """
-    lost = jnp.isnan(first).any(axis=1)
-    reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
-    return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
+    is_lost = jnp.isnan(first).any(axis=1)
+    is_lost_after = jnp.any((second != 0) & is_lost, axis=1) | jnp.isnan(second).any(axis=1)
+    return jnp.where(is_lost_after[:, None], jnp.nan, second @ jnp.where(is_lost[:, None], 0.0, first))
 
 
 class Stack(AbstractCombination):
@@ -236,6 +244,7 @@ class Stack(AbstractCombination):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        """Hold the maps, all of which take the same y."""
         self.maps = check_maps("stack", maps)
         if len({m.inputs for m in self.maps}) != 1:
             raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])
@@ -247,9 +256,9 @@ class Stack(AbstractCombination):
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map; return the next state, and H: their rows [G, n] one above another, and (0, 1) below."""
-        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
-        rows = [h[:-1] for h in drawn]
-        return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
+        state, matrices = self._draw_each(state, jax.random.split(key, len(self.maps)))
+        rows, last_row = [matrix[:-1] for matrix in matrices], np.eye(1, self.inputs + 1, self.inputs)
+        return state, jnp.concatenate([*rows, last_row], axis=0)
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
@@ -274,9 +283,13 @@ class Stack(AbstractCombination):
 
         Row by row it is the product of polynomials in (y, 1), one of each independent map, by intervals.
         """
-        tables = [[stack_parts(m.moment_interval(k)) if k else None for k in range(order + 1)] for m in self.maps]
-        rows = stack_parts(multiply_moments_of_parts(self, order, tables, multiply_interval_polynomials))
-        return rows[:, 0], rows[:, 1]
+        intervals_by_map = []
+        for affine in self.maps:
+            by_order = [stack_parts(affine.moment_interval(k)) for k in range(1, order + 1)]
+            intervals_by_map.append([None, *by_order])
+        rows = stack_parts(multiply_moments_of_parts(self, order, intervals_by_map, multiply_interval_polynomials))
+        lowest, highest = rows[:, 0], rows[:, 1]
+        return lowest, highest
 
     @property
     def in_parallel(self) -> list[AbstractRandomAffine]:
@@ -322,11 +335,12 @@ class Stack(AbstractCombination):
 
         That is zero where a map keeps its noise, and None where all do.
         """
-        parts = [affine.detach_outliers() for affine in self.maps]
-        if all(noise is None for _, noise in parts):
+        maps_and_noises = [affine.detach_outliers() for affine in self.maps]
+        if all(noise is None for _, noise in maps_and_noises):
             return self, None
-        noises = [noise or Gaussian(np.zeros((plain.outputs, plain.outputs))) for plain, noise in parts]
-        return Stack([plain for plain, _ in parts]), Independent(noises)
+        maps = [affine for affine, _ in maps_and_noises]
+        noises = [noise or Gaussian(np.zeros((affine.outputs, affine.outputs))) for affine, noise in maps_and_noises]
+        return Stack(maps), Independent(noises)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Visit each map as one part; return the whole as they became, and the place after it."""

@@ -62,6 +62,7 @@ class Superposed(AbstractCombination):
     def __init__(
         self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
     ):
+        """Hold the maps, the law of the noise n, and for each map the indices in y of its inputs (`places`)."""
         self.maps, self.taken = check_maps("sum", maps), check_count("inputs of a sum", inputs)
         self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
         self.places = tuple(
@@ -97,10 +98,10 @@ class Superposed(AbstractCombination):
 
         Each map of the stack first selects its components of y. The moments of the stack are larger than the sum's.
         """
-        rows = np.eye(self.inputs)
-        stack = Stack([Series([known(rows[list(at)]), m]) for m, at in zip(self.maps, self.places, strict=True)])
-        total = np.tile(np.eye(self.outputs), (1, len(self.maps)))
-        return Series([stack, GainAndNoise(Constant(1.0), total, self.noise)])
+        pairs = zip(self.maps, self.places, strict=True)
+        maps_of_y = [Series([known(np.eye(self.inputs)[list(taken)]), affine]) for affine, taken in pairs]
+        sum_matrix = np.tile(np.eye(self.outputs), (1, len(self.maps)))
+        return Series([Stack(maps_of_y), GainAndNoise(Constant(1.0), sum_matrix, self.noise)])
 
     def sum_in_places(self, parts: Mapping[int, jax.Array | np.ndarray], axes: int) -> jax.Array | np.ndarray:
         """Return the sum of arrays of some of the maps, each put at the places in (y, 1) of what its map takes.
@@ -124,10 +125,11 @@ class Superposed(AbstractCombination):
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and the noise; return the next state, and H of the sum: gains on all of y, and noise."""
         keys = jax.random.split(key, len(self.maps) + 1)
-        state, drawn = self._draw_each(state, keys[:-1])
+        map_keys, noise_key = keys[:-1], keys[-1]
+        state, matrices = self._draw_each(state, map_keys)
         # The maps' gains side by side, then those on each component of y added up.
-        gains = jnp.concatenate([h[:-1, :-1] for h in drawn], axis=1) @ self.selection
-        offset = sum((h[:-1, -1] for h in drawn), self.noise.sample(keys[-1]))
+        gains = jnp.concatenate([matrix[:-1, :-1] for matrix in matrices], axis=1) @ self.selection
+        offset = sum((matrix[:-1, -1] for matrix in matrices), self.noise.sample(noise_key))
         top = jnp.concatenate([gains, offset[:, None]], axis=1)
         return state, jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
@@ -135,8 +137,9 @@ class Superposed(AbstractCombination):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^order(H)] of the sum, from those of the maps and the noise."""
         check_forgets("moments of a map", self)
-        parts = [m.moments(order).matrix[None] for m in self.maps]  # as of one corner, the nominal law
-        return JointMoments(self._add_moments(parts, order)[0], self.outputs, self.inputs, order)
+        matrices = [affine.moments(order).matrix[None] for affine in self.maps]  # as of one corner, the nominal law
+        (matrix,) = self._add_moments(matrices, order)
+        return JointMoments(matrix, self.outputs, self.inputs, order)
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
@@ -158,9 +161,10 @@ class Superposed(AbstractCombination):
 
         `known`: the same of each input.
         """
-        parts = zip(self.maps, self.places, strict=True)
-        rows: KnownGains = np.all([affine.carry_known_gains(known[list(at)]) for affine, at in parts], axis=0)
-        return rows
+        pairs = zip(self.maps, self.places, strict=True)
+        known_by_map = [affine.carry_known_gains(known[list(taken)]) for affine, taken in pairs]
+        known_in_all: KnownGains = np.all(known_by_map, axis=0)
+        return known_in_all
 
     def list_atoms(self) -> list[AffineComponent]:
         """Return the atoms of the sum of a stack."""
@@ -189,8 +193,8 @@ class Superposed(AbstractCombination):
 
         The position behind it is that before it: the links side by side are not on the chain.
         """
-        parts = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
-        visited = [affine.visit_hops(visit, at.select_components(taken))[0] for (affine, at), taken in parts]
+        maps_with_places = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
+        visited = [affine.visit_hops(visit, at.select_components(place))[0] for (affine, at), place in maps_with_places]
         return self.rebuilt(*visited), position
 
     def _add_moments(self, parts: Sequence[Corners], order: int) -> Corners:
@@ -201,13 +205,14 @@ class Superposed(AbstractCombination):
         columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(count_monomials(self.outputs + 1, order), columns, f"moments of order {order}")
         terms = [
-            _expand_map_moments(matrix, m.outputs, chosen, order)
-            for matrix, m, chosen in zip(parts, self.maps, self.places, strict=True)
+            _expand_map_moments(matrix, affine.outputs, taken, order)
+            for matrix, affine, taken in zip(parts, self.maps, self.places, strict=True)
         ]
         # The noise as a map that takes nothing.
-        noise = _expand_map_moments(noise_moment_vector(self.noise, order)[None, :, None], self.outputs, (), order)
-        powers = _add_independent_moments(_sum_maps_by_halves(terms, self.outputs), noise, self.outputs)
-        return _assemble_moments(powers, self.outputs, self.inputs, order)
+        noise_moments = noise_moment_vector(self.noise, order)[None, :, None]
+        noise = _expand_map_moments(noise_moments, self.outputs, places=(), order=order)
+        moments = _add_independent_moments(_sum_maps_by_halves(terms, self.outputs), noise, self.outputs)
+        return _assemble_moments(moments, self.outputs, self.inputs, order)
 
 
 class _SumMoments(NamedTuple):
@@ -236,8 +241,8 @@ def _expand_map_moments(matrix: Corners, outputs: int, places: Places, order: in
     for degree in range(1, order + 1):
         rows, columns = _find_monomials_of_degree(outputs, degree, order), times_one(variables, degree, order)
         # The place of each monomial among those of the sorted variables; then, by argsort, which one has each place.
-        place = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
-        by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place)]])
+        place_in_sorted = place_monomials(sorted_place[factor_variables(variables, degree)], variables)
+        by_degree.append(matrix[:, rows[:, None], columns[np.argsort(place_in_sorted)]])
     return _SumMoments(ordered, by_degree)
 
 
@@ -256,9 +261,9 @@ def _sum_maps_by_halves(terms: Sequence[_SumMoments], outputs: int) -> _SumMomen
     if len(terms) == 1:
         return terms[0]
     middle = len(terms) // 2
-    return _add_independent_moments(
-        _sum_maps_by_halves(terms[:middle], outputs), _sum_maps_by_halves(terms[middle:], outputs), outputs
-    )
+    first_half = _sum_maps_by_halves(terms[:middle], outputs)
+    second_half = _sum_maps_by_halves(terms[middle:], outputs)
+    return _add_independent_moments(first_half, second_half, outputs)
 
 
 def _add_independent_moments(a: _SumMoments, b: _SumMoments, outputs: int) -> _SumMoments:
@@ -290,12 +295,13 @@ def _list_binomial_terms(outputs: int, degree: int) -> tuple[tuple[np.ndarray, .
 
     Each: columns of the places of c, b and c - b, each among monomials of its own degree, and of C(c, b).
     """
-    names = list_exponents(outputs + 1, degree)
+    exponents = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
-    for c, b, rest, weight in zip(*plan_binomial_sums(outputs, degree), strict=True):
-        if not names[c][-1]:  # |c| = degree: no power of 1
-            places = [position(outputs, sum(names[i][:-1]))[names[i][:-1]] for i in (c, b, rest)]
-            by_degree_of_b[sum(names[b][:-1])].append((*places, weight))
+    for c, b, remainder, binomial in zip(*plan_binomial_sums(outputs, degree), strict=True):
+        if not exponents[c][-1]:  # |c| = degree: no power of 1
+            powers = [exponents[i][:-1] for i in (c, b, remainder)]
+            places = [position(outputs, sum(power))[power] for power in powers]
+            by_degree_of_b[sum(exponents[b][:-1])].append((*places, binomial))
     return tuple(tuple(np.array(column) for column in zip(*terms, strict=True)) for terms in by_degree_of_b)
 
 
@@ -305,10 +311,12 @@ def _place_products(a: Places, b: Places, first: int, second: int, size: int) ->
 
     Among the monomials of degree first + second of all `size` variables: entry (i, j) is that of monomial i times j.
     """
-    left, right = np.array(a)[factor_variables(len(a), first)], np.array(b)[factor_variables(len(b), second)]
-    shape = len(left), len(right)
-    both = [np.broadcast_to(left[:, None], (*shape, first)), np.broadcast_to(right, (*shape, second))]
-    return place_monomials(np.concatenate(both, axis=-1), size)
+    variables_a = np.array(a)[factor_variables(len(a), first)]
+    variables_b = np.array(b)[factor_variables(len(b), second)]
+    shape = len(variables_a), len(variables_b)
+    of_a = np.broadcast_to(variables_a[:, None], (*shape, first))
+    of_b = np.broadcast_to(variables_b, (*shape, second))
+    return place_monomials(np.concatenate([of_a, of_b], axis=-1), size)
 
 
 def _assemble_moments(powers: _SumMoments, outputs: int, inputs: int, order: int) -> Corners:
@@ -340,15 +348,16 @@ def move_sensor_into_links(
     C: `matrix`, the sensor's; i: the components of y that link i takes. None where the parts of v that links carry are
     not independent, or where the channel does not begin with a sum.
     """
-    first, *rest = channel.in_series
-    if not isinstance(first, Superposed) or (parts := noise.split(first.places)) is None:
+    first, *later_maps = channel.in_series
+    if not isinstance(first, Superposed) or (noises_of_links := noise.split(first.places)) is None:
         return None
-    links = [
-        Series([GainAndNoise(Constant(1.0), np.asarray(matrix)[list(at)], part), link])
-        for at, part, link in zip(first.places, parts, first.maps, strict=True)
-    ]
-    everything = tuple(range(np.shape(matrix)[1]))
-    return Series([Superposed(links, first.noise, [everything] * len(links), len(everything)), *rest])
+    links = []
+    for taken, noise_of_link, link in zip(first.places, noises_of_links, first.maps, strict=True):
+        sensor_of_link = GainAndNoise(Constant(1.0), np.asarray(matrix)[list(taken)], noise_of_link)
+        links.append(Series([sensor_of_link, link]))
+    n = np.shape(matrix)[1]
+    all_of_x = tuple(range(n))
+    return Series([Superposed(links, first.noise, [all_of_x] * len(links), n), *later_maps])
 
 
 class _MapsWithMemories(NamedTuple):

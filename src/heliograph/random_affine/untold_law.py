@@ -33,11 +33,11 @@ def believe_untold(channel: T) -> T:
         """Return a map by the law of its numbers, or by typical ones; anything but a told map as it is."""
         if not isinstance(leaf, AbstractToldMap):
             return leaf
-        untold = _find_untold(leaf)
-        return leaf.believed(leaf.typical) if untold is None else untold
+        map_of_law = _find_untold(leaf)
+        return leaf.believed(leaf.typical) if map_of_law is None else map_of_law
 
-    known: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
-    return known
+    believed: T = jax.tree.map(believe, channel, is_leaf=_is_told_map)
+    return believed
 
 
 def has_untold_law(channel: AbstractRandomAffine) -> bool:
@@ -46,8 +46,9 @@ def has_untold_law(channel: AbstractRandomAffine) -> bool:
     Not where it has to take typical numbers, nor where the same numbers are told of two maps, which then depend.
     """
     maps = [leaf for leaf in jax.tree.leaves(channel, is_leaf=_is_told_map) if isinstance(leaf, AbstractToldMap)]
-    shared = Counter(affine.memory.identity for affine in maps)
-    return all(_find_untold(affine) is not None for affine in maps) and max(shared.values(), default=0) <= 1
+    counts = Counter(affine.memory.identity for affine in maps)
+    have_laws = all(_find_untold(affine) is not None for affine in maps)
+    return have_laws and max(counts.values(), default=0) <= 1
 
 
 def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
@@ -58,8 +59,8 @@ def draw_told(channel: AbstractRandomAffine, key: jax.Array) -> jax.Array:
     """
     memories = [affine.memory for affine in list_told_maps(channel)]
     keys = jax.random.split(key, len(memories))
-    drawn = [memory.announce(memory.begin(key)) for memory, key in zip(memories, keys, strict=True)]
-    return jnp.concatenate([jnp.ravel(jnp.asarray(told, dtype=float)) for told in drawn])
+    numbers_by_map = [memory.announce(memory.begin(key)) for memory, key in zip(memories, keys, strict=True)]
+    return jnp.concatenate([jnp.ravel(jnp.asarray(numbers, dtype=float)) for numbers in numbers_by_map])
 
 
 def _find_untold(affine: AbstractToldMap) -> AbstractRandomAffine | None:

@@ -39,9 +39,9 @@ def read_plant_inputs(network: Network, inputs: ArrayLike | None, horizon: int) 
 
 def check_precision(precision: object) -> None:
     """Raise ValueError unless `precision` is the name of a precision of a run, one of the words of its type."""
-    known = get_args(Precision.__value__)
-    if not isinstance(precision, str) or precision not in known:
-        raise fail("precision", f"one of {', '.join(known)}", show_value(precision))
+    precisions = get_args(Precision.__value__)
+    if not isinstance(precision, str) or precision not in precisions:
+        raise fail("precision", f"one of {', '.join(precisions)}", show_value(precision))
 
 
 def read_measurements(name: str, value: ArrayLike, steps: int, node: Node | ReceivingNode) -> np.ndarray:
@@ -49,8 +49,8 @@ def read_measurements(name: str, value: ArrayLike, steps: int, node: Node | Rece
 
     (steps,) is accepted for one component. A table whose columns have the components' names must have their order too.
     """
-    what, received = f"measurements of node {name!r}", node.received
-    check_columns(what, value, node.received_names)
-    flat = received == 1 and rank(what, value) == 1
-    values: np.ndarray = array(what, value, (steps,) if flat else (steps, received), missing=True)
-    return values[:, None] if flat else values
+    title, received = f"measurements of node {name!r}", node.received
+    check_columns(title, value, node.received_names)
+    is_one_axis = received == 1 and rank(title, value) == 1
+    values: np.ndarray = array(title, value, (steps,) if is_one_axis else (steps, received), missing=True)
+    return values[:, None] if is_one_axis else values

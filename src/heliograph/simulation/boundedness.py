@@ -271,13 +271,15 @@ class KnownGainSums(NamedTuple):
         D is `combine`. With z = G y, y = (v, 1) at x = 0, and M = `mean` that of G over these outcomes, it is
         D E[(G y - M E y) (G y - M E y)'] D', where the last entry of y takes G's offset.
         """
-        mean, second = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
+        mean, gain_moments = second_moments(outcome.map)  # E G, and E[G_ia G_jb] as [i, j, a, b], in this outcome
         mean_signal = np.append(links.sensor_mean, 1.0)
-        signal = np.outer(mean_signal, mean_signal)  # E[y y']
-        signal[:-1, :-1] += links.sensor_noise
-        about, center = self.mean @ mean_signal, mean @ mean_signal  # M E y, and E[G] E y in this outcome
-        spread = np.einsum("ijab,ab->ij", second, signal) - np.outer(center, about) - np.outer(about, center)
-        return np.asarray(self.combine @ (spread + np.outer(about, about)) @ self.combine.T)
+        signal_moments = np.outer(mean_signal, mean_signal)  # E[y y']
+        signal_moments[:-1, :-1] += links.sensor_noise
+        mean_received, mean_in_outcome = self.mean @ mean_signal, mean @ mean_signal  # M E y, and E[G] E y
+        second = np.einsum("ijab,ab->ij", gain_moments, signal_moments)  # E[G y y' G']
+        cross = np.outer(mean_in_outcome, mean_received)
+        noise = second - cross - cross.T + np.outer(mean_received, mean_received)
+        return np.asarray(self.combine @ noise @ self.combine.T)
 
 
 def _find_known_sums(
@@ -316,12 +318,12 @@ def _find_known_sums(
     )
 
 
-def _describe_certificate(a: Float[np.ndarray, "n n"], radius: float) -> str:
+def _describe_certificate(transition: Float[np.ndarray, "n n"], radius: float) -> str:
     """Return in words why errors stay bounded: a stable plant, or fixed gains of this spectral radius of the error.
 
-    `a`: the plant's transition matrix.
+    `transition`: the plant's transition matrix.
     """
-    if spectral_radius(a) < BELOW_ONE:
+    if spectral_radius(transition) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
 
@@ -390,5 +392,7 @@ def _is_mode_excited(
     # Over several steps: measurements without noise could remove it on the way.
     if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in known.system.noises):
         return False
+    if is_excited_by_noise(directions, a, q):
+        return True
     start = q + np.asarray(first(network.plant).initial_covariance)
-    return is_excited_by_noise(directions, a, q) or (unseen.growth > 1 and is_excited_by_noise(directions, a, start))
+    return unseen.growth > 1 and is_excited_by_noise(directions, a, start)

@@ -78,10 +78,11 @@ def lower_to_nominal(filter: AbstractFilter) -> AbstractFilter:
 
     leaves, tree = jax.tree.flatten(filter, is_leaf=is_inner)
     inner = [lower_to_nominal(leaf) if is_inner(leaf) else leaf for leaf in leaves]
-    twin: AbstractFilter = copy(jax.tree.unflatten(tree, inner))  # the copy, which is changed in place
-    object.__setattr__(twin, "claim", lower_claim(filter.claim))
-    object.__setattr__(twin, "kept", StaticPremise(filter.premise, filter.claim != twin.claim or filter.kept.lowered))
-    return twin
+    lowered: AbstractFilter = copy(jax.tree.unflatten(tree, inner))
+    object.__setattr__(lowered, "claim", lower_claim(filter.claim))  # fields are frozen
+    was_lowered = filter.claim != lowered.claim or filter.kept.lowered
+    object.__setattr__(lowered, "kept", StaticPremise(filter.premise, was_lowered))
+    return lowered
 
 
 def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFilter:
@@ -98,14 +99,13 @@ def lower_claim_if_mistaken(own: Premise, filter: AbstractFilter) -> AbstractFil
 
 def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
     """Return the nodes, each filter's claim lowered to "nominal" if it was made for other models than the node's."""
-    results = dict(network.nodes)
+    nodes = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
-            own = find_premise(network, name)
-            results[name] = _replace_filters(
-                node, {f: lower_claim_if_mistaken(own, filter) for f, filter in node.filters.items()}
-            )
-    return results
+            own_models = find_premise(network, name)
+            filters = {label: lower_claim_if_mistaken(own_models, filter) for label, filter in node.filters.items()}
+            nodes[name] = _replace_filters(node, filters)
+    return nodes
 
 
 def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
@@ -113,13 +113,12 @@ def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, No
 
     Those of filters that know a sender's heartbeat differ: the longest decides.
     """
-    every = [filter for node in nodes.values() for filter in node.filters.values()]
-    return {
-        name: _replace_filters(
-            node, {f: filter.with_room_for_heartbeats_of(every) for f, filter in node.filters.items()}
-        )
-        for name, node in nodes.items()
-    }
+    all_filters = [filter for node in nodes.values() for filter in node.filters.values()]
+    padded: dict[str, Node | ReceivingNode] = {}
+    for name, node in nodes.items():
+        filters = {label: filter.with_room_for_heartbeats_of(all_filters) for label, filter in node.filters.items()}
+        padded[name] = _replace_filters(node, filters)
+    return padded
 
 
 def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
@@ -129,10 +128,12 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
     """
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
-    own = find_common_premise(network)
+    own_models = find_common_premise(network)
     return {
-        name: lower_claim_if_mistaken(own, f) if isinstance(f, AbstractFilter) else f
-        for name, f in network.fused.items()
+        name: lower_claim_if_mistaken(own_models, filter_or_fusion)
+        if isinstance(filter_or_fusion, AbstractFilter)
+        else filter_or_fusion
+        for name, filter_or_fusion in network.fused.items()
     }
 
 
@@ -156,9 +157,9 @@ def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilt
     """
     if all(filters[name] is node.filters[name] for name in filters):
         return node
-    twin = copy(node)
-    object.__setattr__(twin, "filters", filters)
-    return twin
+    changed = copy(node)
+    object.__setattr__(changed, "filters", filters)  # fields are frozen
+    return changed
 
 
 def list_mistaken_parts(own: Premise, filter: AbstractFilter) -> tuple[str, ...]:
@@ -224,23 +225,26 @@ def _yield_mistaken_beliefs(node: str, own: Premise, filters: Mapping[str, Abstr
     Those that do not say for which models they were made (no premise) are passed over, unless lowered already.
     """
     for label, filter in filters.items():
-        says = filter.premise is not None or filter.kept.lowered
-        if filter.claim != "none" and says and (parts := list_mistaken_parts(own, filter)):
-            yield MistakenBelief(node, label, parts, filter.kept.lowered)
+        is_known = filter.premise is not None or filter.kept.lowered
+        if filter.claim != "none" and is_known and (mistaken_parts := list_mistaken_parts(own, filter)):
+            yield MistakenBelief(node, label, mistaken_parts, filter.kept.lowered)
 
 
 def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
     """Return the claim of each estimate of a network, by (node, name); those of the centre last, under FUSED."""
-    claims = {(name, f): filter.claim for name, node in network.nodes.items() for f, filter in node.filters.items()}
+    claims = {
+        (name, filter_name): filter.claim
+        for name, node in network.nodes.items()
+        for filter_name, filter in node.filters.items()
+    }
     for name, mesh in network.meshes.items():
-        claims |= dict.fromkeys(
-            ((node, name) for node in network.mesh_nodes(name)), find_claim_of_mesh(name, mesh, network)
-        )
+        claim_of_mesh = find_claim_of_mesh(name, mesh, network)
+        claims |= {(node, name): claim_of_mesh for node in network.mesh_nodes(name)}
     # Where data decide what arrives, no fusion can claim more than "nominal".
-    by_data = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
+    do_data_decide = any(isinstance(node, Node) and node.chosen_by_value for node in network.nodes.values())
     for name, fusion in network.fused.items():
         claim = _find_claim_of_fusion(network, fusion)
-        claims[FUSED, name] = lower_claim(claim) if by_data and isinstance(fusion, Fusion) else claim
+        claims[FUSED, name] = lower_claim(claim) if do_data_decide and isinstance(fusion, Fusion) else claim
     return claims
 
 

@@ -213,7 +213,8 @@ def _find_times(
     """
     if time is not None:
         return check_times("time", time, steps)
-    return find_common_dates({**{f"measurements of node {name!r}": z for name, z in measured.items()}, **others})
+    tables = {f"measurements of node {name!r}": z for name, z in measured.items()}
+    return find_common_dates({**tables, **others})
 
 
 def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
@@ -223,7 +224,11 @@ def _describe_left_out(network: Network, record: Record) -> Iterator[str]:
     """
     for node, filters in record.weighed.items():
         if node == FUSED:
-            names = [f"{each}: {name}" for each in record.measurements for name in network.nodes[each].received_names]
+            names = [
+                f"{node_name}: {name}"
+                for node_name in record.measurements
+                for name in network.nodes[node_name].received_names
+            ]
         else:
             names = list(network.nodes[node].received_names)
         for filter in filters:
@@ -295,8 +300,8 @@ def _filter_without_implausible_data(
 
 
 def _find_refused_rows(
-    network: Network, outputs: PyTree, z: dict[str, np.ndarray], grouped: tuple[np.ndarray, ...], task: FilteringTask,
-    before: dict[str, dict[int, str]],
+    network: Network, outputs: PyTree, z: dict[str, np.ndarray], z_by_group: tuple[np.ndarray, ...],
+    task: FilteringTask, before: dict[str, dict[int, str]],
 ) -> dict[str, dict[int, str]]:  # fmt: skip
     """Return, by node, the rows that its filters refuse and that were not refused `before`, with the reason.
 
@@ -306,16 +311,19 @@ def _find_refused_rows(
         network: the network.
         outputs: of filtering the rows with judgements, by row.
         z: measurements by node.
-        grouped: the same (steps, node, received) by group.
+        z_by_group: the same (steps, node, received) by group.
         task: filters and all else that the recording is filtered with.
         before: rows that were refused already, by node, with the reason.
     """
     refused, centrally = find_refused_rows(network, outputs)  # by nodes' filters, and by those of all measurements
     filters, u = task.filters, task.u
     if centrally:
-        states = find_central_states_before_rows(task, grouped)
+        states = find_central_states_before_rows(task, z_by_group)
         in_order = {name: z[name] for name in network.names}
         nodes = JudgementReader(network).without_own
         refused |= blame_nodes_for_implausible_rows(filters.central, states, in_order, u, centrally, nodes)
-    new = {name: {k: why for k, why in rows.items() if k not in before.get(name, ())} for name, rows in refused.items()}
-    return {name: rows for name, rows in new.items() if rows}
+    new_rows = {
+        name: {k: reason for k, reason in rows.items() if k not in before.get(name, ())}
+        for name, rows in refused.items()
+    }
+    return {name: rows for name, rows in new_rows.items() if rows}

@@ -80,15 +80,19 @@ def step_plausibly(
         return (turn == 0) | (turn == 1) & is_implausible(outputs)
 
     def step(carry: tuple[jax.Array, Stepped]) -> tuple[jax.Array, Stepped]:
-        """Return the next turn's number, and all filters stepped from `states`, those before the step, in every turn.
+        """Return the next turn's number, and all filters stepped without what the turn before judged implausible.
 
-        They step without what the turn before judged implausible; in turn 0 that is nothing.
+        In turn 0 that is nothing. Closed over, the same in every turn: the network's `filters`, their `states` before
+        the step, its measurements z, inputs u and number k, and the losses `drawn` of the uplinks.
         """
-        turn, (_, before) = carry
-        after, outputs = _step_filters(filters, states, z, u, k, drawn, read_refusal_reasons(before))
+        turn, (_, outputs_before) = carry
+        skip = read_refusal_reasons(outputs_before)
+        after, outputs = _step_filters(filters, states, z, u, k, drawn, skip)
         # The first turn judges all data, the second what is left of them: the first's judgements stay.
         for name in ("judged", "judged_centrally"):
-            outputs[name] = jax.tree.map(lambda old, new: jnp.where(turn == 0, new, old), before[name], outputs[name])
+            outputs[name] = jax.tree.map(
+                lambda first, now: jnp.where(turn == 0, now, first), outputs_before[name], outputs[name]
+            )
         return turn + 1, (after, outputs)
 
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), output_shapes)
@@ -101,7 +105,7 @@ class JudgementReader:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
-        """Find, for each node, the places among the stacked filters of those that receive measurements."""
+        """List, for each node, where its filters that receive measurements stand in the network's stacks of filters."""
         self._places: dict[str, list[EstimatePlace]] = {name: [] for name in network.names}
         for (node, name), place in network.places.items():
             if network.nodes[node].filters[name].received:
@@ -119,7 +123,7 @@ class JudgementReader:
         places = []
         for kind, judgement in enumerate(outputs["judged"]):
             filters, nodes = judgement.distance.shape[-2:]
-            places += [EstimatePlace(kind, f, i) for f, i in np.ndindex(filters, nodes)]
+            places += [EstimatePlace(kind, filter, node) for filter, node in np.ndindex(filters, nodes)]
         return self._stack_judgements(outputs, places, central=True)
 
     def _stack_judgements(
@@ -154,13 +158,15 @@ def find_refused_rows(
     Nodes without filters of their own are judged by the central ones, all alike: the first tells for all. `outcome`:
     what filtering the rows with judgements put out.
     """
-    judges, refused = JudgementReader(network), dict[str, dict[int, str]]()
-    without_own = judges.without_own
+    reader, refused = JudgementReader(network), dict[str, dict[int, str]]()
+    without_own = reader.without_own
     for name in network.names:
-        if name not in without_own and (reasons_by_row := _list_rows_refused_by_all(judges.read_node(outcome, name))):
-            refused[name] = reasons_by_row
-    central = _list_rows_refused_by_all(judges.read_node(outcome, without_own[0])) if without_own else {}
-    return refused, central
+        if name not in without_own:
+            reasons_by_row = _list_rows_refused_by_all(reader.read_node(outcome, name))
+            if reasons_by_row:
+                refused[name] = reasons_by_row
+    refused_centrally = _list_rows_refused_by_all(reader.read_node(outcome, without_own[0])) if without_own else {}
+    return refused, refused_centrally
 
 
 def _list_rows_refused_by_all(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
@@ -242,15 +248,16 @@ class _NonFiniteFunctionFinder:
         return f"; {fault}" if fault else ""
 
 
-def _find_flagged(votes: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
+def _find_flagged(judgements: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
     """Return the numbers of the rows in which this field of some filter's judgement is over 0.
 
-    `votes`: the judgements, whose last axis are the fields of a Judgement.
+    `judgements`: the judgements, whose last axis are the fields of a Judgement.
     """
-    if not votes.size:
+    if not judgements.size:
         return []
-    flagged: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(field)] > 0).any(axis=-1)).tolist()
-    return flagged
+    is_over = judgements[..., Judgement._fields.index(field)] > 0  # by row and filter
+    rows: list[int] = np.flatnonzero(is_over.any(axis=-1)).tolist()
+    return rows
 
 
 def _format_rows(rows: Sequence[int]) -> str:

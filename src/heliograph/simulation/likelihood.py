@@ -44,9 +44,9 @@ def log_likelihood(
     arguments = filter, *check_data(filter, measurements, inputs)
     if is_traced(arguments):
         return _sum_log_likelihoods(*arguments)
-    whole = sum_filtered_in_chunks(*arguments, _judge_likelihood)  # None where it cannot be done in chunks
-    if whole is not None:
-        return float(whole)
+    total = sum_filtered_in_chunks(*arguments, _judge_likelihood)
+    if total is not None:  # it could be done in chunks
+        return float(total)
     return float(compute_once(_sum_log_likelihoods, _sum_by_xla, arguments))
 
 
@@ -54,7 +54,8 @@ def _sum_log_likelihoods(
     filter: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> jax.Array:
     """Return the sum of the innovations' log-likelihoods over all rows, filtered one after another."""
-    return jnp.sum(filter.scan(z, u, partial(_judge_likelihood, filter)))
+    log_likelihoods = filter.scan(z, u, partial(_judge_likelihood, filter))
+    return jnp.sum(log_likelihoods)
 
 
 def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: jax.Array) -> jax.Array:

@@ -46,11 +46,8 @@ def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | M
     """Return the filters, also inside of others, that use flags: numbers behind the measurement that say a mode."""
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
-    return [
-        leaf
-        for leaf in leaves
-        if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged)
-    ]
+    filters = [leaf for leaf in leaves if isinstance(leaf, kinds)]
+    return [filter for filter in filters if isinstance(filter, ModeObservedFilter) or filter.flagged]
 
 
 def _reveals_mode(affine: AbstractRandomAffine, late: bool) -> bool:

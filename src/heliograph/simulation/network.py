@@ -153,12 +153,12 @@ class Network(Module):
 
     def _check_nodes(self) -> None:
         """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
-        kind = Node if self.relays is None and self.common is None else ReceivingNode
+        node_type = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
             if not isinstance(node, ReceivingNode) or node.filters:  # else what neighbours send, or nothing
-                check_type(f"node {name!r}", node, kind)
-            for label, element in node.filters.items():
-                check_states(f"filter {label!r} of node {name!r}", element, self)
+                check_type(f"node {name!r}", node, node_type)
+            for label, filter in node.filters.items():
+                check_states(f"filter {label!r} of node {name!r}", filter, self)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -276,14 +276,16 @@ class Network(Module):
         Raises:
             ValueError: a node that is not a relay is lacking, or there is one too many.
         """
-        given, optional = set(names), set() if self.relays is None else set(self.relays.relays)
+        measured_nodes = set(names)
+        optional = set() if self.relays is None else set(self.relays.relays)
         # Names that are given and no node's, or the reverse; relays alone may lack.
-        mismatched = sorted((given ^ set(self.nodes)) - (optional - given))
+        mismatched = sorted((measured_nodes ^ set(self.nodes)) - (optional - measured_nodes))
         if mismatched:
             raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {mismatched}")
-        if len(given) == len(self.nodes):
+        if len(measured_nodes) == len(self.nodes):
             return self
-        return Network(self.plant, {n: v for n, v in self.nodes.items() if n in given}, relays=self.relays)
+        nodes = {name: node for name, node in self.nodes.items() if name in measured_nodes}
+        return Network(self.plant, nodes, relays=self.relays)
 
     def nodes_with(self, name: str) -> list[str]:
         """Return the names of the nodes that have the filter `name`, in the order of the network.
@@ -291,11 +293,11 @@ class Network(Module):
         Raises:
             ValueError: none has it.
         """
-        results = [node for node in self.names if name in self.nodes[node].filters]
-        if not results:
-            known = sorted({f for node in self.nodes.values() for f in node.filters})
-            raise fail("fusion", f"a filter that some node has {known}", repr(name))
-        return results
+        nodes_with_filter = [node for node in self.names if name in self.nodes[node].filters]
+        if not nodes_with_filter:
+            known_filters = sorted({filter for node in self.nodes.values() for filter in node.filters})
+            raise fail("fusion", f"a filter that some node has {known_filters}", repr(name))
+        return nodes_with_filter
 
     def mesh_nodes(self, name: str) -> tuple[str, ...]:
         """Return the names of the nodes of a fusion between neighbours, in the order of the network."""
@@ -305,13 +307,13 @@ class Network(Module):
     @property
     def shared(self) -> dict[str, tuple[str, ...]]:
         """Names of the nodes that share something, by its name: fading (`hg.shared`), or one channel for all."""
-        named: dict[str, list[str]] = {}
+        nodes_by_memory: dict[str, list[str]] = {}
         for name, node in self.nodes.items():
             for memory in memories(node.channel).values() if isinstance(node, Node) else ():
                 if memory.name is not None:
-                    named.setdefault(memory.name, []).append(name)
-        results = {name: tuple(nodes) for name, nodes in named.items() if len(nodes) > 1}
-        return results if self.common is None else {"sensor and channel": self.names}
+                    nodes_by_memory.setdefault(memory.name, []).append(name)
+        shared = {name: tuple(nodes) for name, nodes in nodes_by_memory.items() if len(nodes) > 1}
+        return shared if self.common is None else {"sensor and channel": self.names}
 
     @cached_property
     def angles(self) -> dict[str, Angles]:
@@ -343,22 +345,23 @@ class Network(Module):
         """Return the network whose estimates claim "nominal" at most, as where digits are lost that nothing bounds."""
         lowered = copy(self)  # without the constructor, which would check all again
         claimed = FrozenMapping({place: lower_claim(claim) for place, claim in self.claimed.items()})
-        for field, value in (
-            ("nodes", make_nodes_nominal(self)),
-            ("fused", make_fusions_nominal(self)),
-            ("claimed", claimed),
-        ):
-            object.__setattr__(lowered, field, value)
+        # Fields are frozen.
+        object.__setattr__(lowered, "nodes", make_nodes_nominal(self))
+        object.__setattr__(lowered, "fused", make_fusions_nominal(self))
+        object.__setattr__(lowered, "claimed", claimed)
         return lowered
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Return sensor, channel and the filter `name` of each node that has it and receives over a channel.
 
-        Its own, or those that are common to all nodes; a node behind relays has neither.
+        The sensor and channel are the node's own, or those common to all nodes; a node behind relays has neither.
         """
         nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
-        sources = {label: n if isinstance(n, Node) else self.common for label, n in nodes.items()}  # None behind relays
-        return {label: (s.sensor, s.channel, nodes[label].filters[name]) for label, s in sources.items() if s}
+        # Which object has the sensor and channel of each node: the node, or what all share; None behind relays.
+        owners = {label: node if isinstance(node, Node) else self.common for label, node in nodes.items()}
+        return {
+            label: (owner.sensor, owner.channel, nodes[label].filters[name]) for label, owner in owners.items() if owner
+        }
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

@@ -129,17 +129,17 @@ class AllFilters(Module):
         node, n), filter after filter. `centre.sources`: (kind, number within the kind) of what it fuses.
         """
         means = []
-        for kind, f in centre.sources:
-            by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
-            means.append(by_filter[f])
+        for kind, filter in centre.sources:
+            means_by_filter = gaussian_of(states[kind]).mean.reshape(self.alike[kind].count, -1, self.n)
+            means.append(means_by_filter[filter])
         return centre.init(means)
 
     @property
     def are_linear_and_unfused(self) -> bool:
         """Whether all filters are linear, with gains that depend on no data, and no estimates of theirs are fused."""
         filters = [*(stacked.filters for stacked in self.alike), *self.central.values()]
-        fuses = self.fusions or self.centres or self.reporting or self.meshes
-        return not fuses and all(filter.is_linear for filter in filters)
+        are_fused = self.fusions or self.centres or self.reporting or self.meshes
+        return not are_fused and all(filter.is_linear for filter in filters)
 
     @property
     def linear_centres(self) -> tuple[FusionCentre, ...]:
@@ -153,9 +153,9 @@ class AllFilters(Module):
         measurements of zero do.
         """
         matrices = []
-        for kind, f in centre.sources:
-            alike, zeros = self.alike[kind], self._make_zeros(kind)
-            matrices.append(alike.compute_by_node(centre.compute_matrices, states[kind], f, zeros, u, k))
+        for kind, filter in centre.sources:
+            stacked, zeros = self.alike[kind], self._make_zeros(kind)
+            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[kind], filter, zeros, u, k))
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
@@ -256,9 +256,9 @@ class AllFilters(Module):
 
         Each as (field of `StepOutput`, its name among the outputs of the nodes' filters, and of central filters).
         """
-        judged = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
+        judgements = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
         steps = [("steps", "smoother_steps", "central_steps")]
-        return (steps if self.smooths else []) + (judged if self.judges else [])
+        return (steps if self.smooths else []) + (judgements if self.judges else [])
 
     def _step_fusions(
         self,
@@ -387,6 +387,8 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     text("fusion", name)
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
-        by_reports = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
+        by_reports = [
+            label for label, other in network.fused.items() if isinstance(other, Fusion) and other.rule.uses_reports
+        ]
         raise fail("fusion", f"one of {by_reports}, which receive reports", repr(name))
     return build_centre_filter(network, name, fusion, AllFilters)

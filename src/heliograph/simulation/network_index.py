@@ -41,10 +41,10 @@ def find_estimate_places(
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
     """Return names in groups of items that differ in numbers alone, in order of first appearance."""
-    results: dict[object, list[str]] = {}
-    for name, described in items:
-        results.setdefault(structure_key(described), []).append(name)
-    return tuple(tuple(names) for names in results.values())
+    names_by_structure: dict[object, list[str]] = {}
+    for name, model in items:
+        names_by_structure.setdefault(structure_key(model), []).append(name)
+    return tuple(tuple(names) for names in names_by_structure.values())
 
 
 def list_alike_filters(
@@ -66,9 +66,9 @@ def list_alike_meshes(groups: Sequence[Sequence[str]], meshes: Mapping[str, Sequ
 
     Sorted by name, as compiled code has them. `meshes`: names of the fusions of each node.
     """
-    every = sorted({mesh for of_node in meshes.values() for mesh in of_node})
+    all_meshes = sorted({mesh for of_node in meshes.values() for mesh in of_node})
     return tuple(
-        AlikeFilters(g, (mesh,)) for mesh in every for g, names in enumerate(groups) if mesh in meshes[names[0]]
+        AlikeFilters(g, (mesh,)) for mesh in all_meshes for g, names in enumerate(groups) if mesh in meshes[names[0]]
     )
 
 
@@ -84,6 +84,6 @@ def find_measurement_order(groups: Iterable[Sequence[str]], rows: Mapping[str, r
     `rows`: where each node's measurements stand in the latter. None where the two are the same: no gather is compiled
     then.
     """
-    by_group = np.concatenate([rows[name] for names in groups for name in names])  # place of each in the nodes' order
-    order = np.argsort(by_group)
+    position_by_group = np.concatenate([rows[name] for names in groups for name in names])  # in the nodes' order
+    order = np.argsort(position_by_group)
     return None if np.array_equal(order, np.arange(len(order))) else order

@@ -95,7 +95,7 @@ class Node(Module):
         timeout: float | None = None,
     ):
         """Check that sensor, channel, trigger, encoder and filters fit, and find what the filters receive."""
-        self.timeout = None if timeout is None else float(scalar("timeout", timeout, TINY))
+        self.timeout = None if timeout is None else float(scalar("timeout", timeout, low=TINY))
         self.trigger, self.encoder = trigger, encoder
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         # Sensor and channel fit.
@@ -161,9 +161,10 @@ class Node(Module):
         dithers = [f"dither_{self.outputs[place]}" for place in find_carried_components(channel) if place != FLAG]
         values = name_received_values(self.outputs, channel, self.received - channel.outputs - len(dithers))
         # Of an output that arrives several times, such as over two links, the dithers are numbered.
-        several = {name for name in dithers if dithers.count(name) > 1}
+        repeated = {name for name in dithers if dithers.count(name) > 1}
+        numbers = [dithers[: i + 1].count(name) for i, name in enumerate(dithers)]  # among those of one name
         return values + tuple(
-            f"{name}_{dithers[: i + 1].count(name)}" if name in several else name for i, name in enumerate(dithers)
+            f"{name}_{number}" if name in repeated else name for name, number in zip(dithers, numbers, strict=True)
         )
 
 
@@ -272,9 +273,8 @@ def check_received(name: str, filter: AbstractFilter, received: int) -> None:
     `name`: of the filter, for errors. `received`: how many arrive.
     """
     if filter.received not in (0, received):  # 0: it uses no measurements
-        raise fail(
-            name, f"one that receives the {received} numbers that arrive", f"one that receives {filter.received}"
-        )
+        expected = f"one that receives the {received} numbers that arrive"
+        raise fail(name, expected, f"one that receives {filter.received}")
 
 
 def check_states(name: str, filter: object, network: HasNodes) -> None:
@@ -286,9 +286,16 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
     """
     plant = first(network.plant)
     if isinstance(filter, AbstractFilter):
-        for what, ours, theirs in (("states", plant.states, filter.states), ("inputs", plant.inputs, filter.inputs)):
-            if len(ours) != len(theirs):
-                raise fail(name, f"the plant's {len(ours)} {what} {list(ours)}", f"{len(theirs)} {list(theirs)}")
+        for kind, of_plant_names, of_filter_names in (
+            ("states", plant.states, filter.states),
+            ("inputs", plant.inputs, filter.inputs),
+        ):
+            if len(of_plant_names) != len(of_filter_names):
+                raise fail(
+                    name,
+                    f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
+                    f"{len(of_filter_names)} {list(of_filter_names)}",
+                )
     # Attitudes are turned where others are added.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:
@@ -328,7 +335,7 @@ def get_parts_of_reception(node: Node | ReceivingNode) -> object:
     Nodes where these have one structure, and differ in numbers alone, are simulated as a group.
     """
     if isinstance(node, Node):
-        places = None if node.encoder is None else find_carried_components(node.channel)
+        carried = None if node.encoder is None else find_carried_components(node.channel)
         link = drop_names(node.channel)
-        return node.sensor, link, node.informed_by, node.trigger, node.encoder, places, node.predictor
+        return node.sensor, link, node.informed_by, node.trigger, node.encoder, carried, node.predictor
     return node.received, node.complete

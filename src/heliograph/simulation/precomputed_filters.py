@@ -21,13 +21,13 @@ def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -
 
     Only of filters whose nodes always receive all data (`complete`, by group); central filters receive all nodes'.
     """
-    planned = [_precompute_stack(a, u) if filters.complete[a.group] else a for a in filters.alike]
-    central = filters.central if all(filters.complete) else {}
-    central = {
+    stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.alike]
+    central_planned = filters.central if all(filters.complete) else {}
+    central_planned = {
         name: compute_once(_precompute_filter, _precompute_by_xla, (filter, u, filters.smooths))
-        for name, filter in central.items()
+        for name, filter in central_planned.items()
     }
-    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(planned), filters.central | central))
+    changed = eqx.tree_at(lambda f: (f.alike, f.central), filters, (tuple(stacks), filters.central | central_planned))
     return cast(AllFilters, to_numpy(changed))
 
 
@@ -36,9 +36,10 @@ def _precompute_stack(alike: StackedFilters, u: Array) -> StackedFilters:
 
     By one program for all: this library's native code, or XLA's where that refuses.
     """
-    count, arguments = alike.count * alike.nodes, (alike.filters, u, alike.smooths)
+    count = alike.count * alike.nodes
+    arguments = alike.filters, u, alike.smooths
     with jax.enable_x64(True):
-        choice = choose_code(_precompute_filter, arguments, (True, False, False))
+        choice = choose_code(_precompute_filter, arguments, differs_by_run=(True, False, False))
         if choice.code is None:
             return replace(alike, filters=to_numpy(_precompute_all_by_xla(*arguments, count)))
     # What is the same for all filters is computed once, and repeated for each.

@@ -17,9 +17,10 @@ def draw_key(run_key: jax.Array, k: Number, source: Number, purpose: int) -> jax
 
     `source`: checksum of the name of what draws; `purpose`: number of what is drawn.
     """
+    key = run_key
     for number in (k, source, purpose):
-        run_key = jax.random.fold_in(run_key, number)
-    return run_key
+        key = jax.random.fold_in(key, number)
+    return key
 
 
 def checksum(name: str) -> int:

@@ -79,8 +79,10 @@ def read_recording_start(filters: AllFilters, after: Record, smooths: bool) -> O
         raise fail("after", EXPECTED, "a record without the last states of its filters")
     if smooths:
         raise fail("after", "no smoothing, which needs all rows at once", "smooth")
-    if late := [*filters.reporting, *filters.meshes]:
-        raise fail("after", "no fusion by reports or between neighbours, which may come rows later", late)
+    if fusions_with_delays := [*filters.reporting, *filters.meshes]:
+        raise fail(
+            "after", "no fusion by reports or between neighbours, which may come rows later", fusions_with_delays
+        )
     if not origin.has_form_of(jax.eval_shape(filters.init)):
         raise fail("after", EXPECTED, "one of another network")
     return origin
@@ -94,10 +96,12 @@ def continue_times(origin: Origin | None, clock: np.ndarray) -> np.ndarray:
     """
     if origin is None:  # nothing is before them
         return clock
-    last, first = np.asarray(origin.time), clock[0]
-    if last.dtype.kind != clock.dtype.kind or first < last:  # a date and a number, or times that go backwards
-        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first))
-    return np.append(last, clock)
+    last_time, first_time = np.asarray(origin.time), clock[0]
+    if (
+        last_time.dtype.kind != clock.dtype.kind or first_time < last_time
+    ):  # a date and a number, or times that go backwards
+        raise fail("time", f"rows behind {origin.time}, the last one before them", str(first_time))
+    return np.append(last_time, clock)
 
 
 def filter_rows(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool) -> PyTree:
@@ -143,7 +147,8 @@ def _filter_in_chunks(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree 
         return None
     # Where rows are more of a recording, they begin at its last states and step.
     begin = task.begin or RecordingStart(initial_states(task.filters), np.asarray(0))
-    filtered = scan_in_chunks(NetworkRecursion(task.filters, begin.step), to_numpy(begin.states), (z, task.u))
+    recursion = NetworkRecursion(task.filters, begin.step)
+    filtered = scan_in_chunks(recursion, to_numpy(begin.states), (z, task.u))
     return None if filtered is None else _collect_results(None, z, *filtered)
 
 
@@ -190,12 +195,12 @@ def _scan_rows(
     def step_row(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         """Return the states of all filters after one row, and what they made of it.
 
-        The row: step, inputs, measurements, what arrived, and a flag. False leaves the states as they are, as rows
-        that only fill up a scan do; None: all rows count. `judged`: what is implausible is left out.
+        The row: step, inputs, measurements, what arrived of reports, and a flag: False leaves the states as they are,
+        as for rows that only fill up a scan; None: all rows count. `judged`: what is implausible is left out.
         """
-        (k, u_k, z_k, drawn), row_is_counted = row
+        (k, u_k, z_k, arrivals), row_is_counted = row
         step = step_plausibly if judged else AllFilters.step
-        after, results = step(filters, states, z_k, u_k, k, drawn)
+        after, results = step(filters, states, z_k, u_k, k, arrivals)
         if row_is_counted is not None:
             after = jax.tree.map(lambda new, old: jnp.where(row_is_counted, new, old), after, states)
         return after, results
@@ -213,7 +218,8 @@ def _collect_results(
     """
     results = {"measurements": z, **results}
     judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
-    return (results if smoother is None else smoother.smooth_run(results)) | judged | {"state": state}
+    smoothed = results if smoother is None else smoother.smooth_run(results)
+    return smoothed | judged | {"state": state}
 
 
 def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ...]) -> PyTree:
@@ -232,8 +238,8 @@ def _collect_central_states(task: FilteringTask, z: tuple[np.ndarray, ...]) -> P
 
         The row: step, inputs, measurements, and what arrived of reports.
         """
-        k, u_k, z_k, drawn = row
-        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, drawn)
+        k, u_k, z_k, arrivals = row
+        after, _ = step_plausibly(task.filters, states, z_k, u_k, k, arrivals)
         _, central, *_ = states
         return after, central
 

@@ -88,7 +88,8 @@ def _describe_refused(
         node: the node.
     """
     # The readings that were refused for this reason alone, in the first row that has some.
-    here = np.where(refused == number_of_reason(reason), refused, 0)
-    row, came = int(np.argmax(here.any(axis=1))), int(np.count_nonzero(~np.isnan(z)))
-    why = limits.describe_missing(z[row], here[row], node.received_names)
-    return f"{np.count_nonzero(here)} of {came} values count as not arrived, by {reason}; row {row + 1}: {why}"
+    refused_so = np.where(refused == number_of_reason(reason), refused, 0)
+    row = int(np.argmax(refused_so.any(axis=1)))
+    shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(z))} values"
+    description = limits.describe_missing(z[row], refused_so[row], node.received_names)
+    return f"{shares} count as not arrived, by {reason}; row {row + 1}: {description}"

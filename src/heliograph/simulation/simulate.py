@@ -157,12 +157,12 @@ def _warn_beyond_limits(record: Record, network: Network) -> None:
     """
     for name, (low, high) in first(network.plant).limits if record.truth is not None else ():
         x = np.asarray(record.truth)[..., network.states.index(name)]
-        beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
-        if beyond.any():
-            where = f"in {beyond.any(axis=1).sum()} of {len(beyond)} runs"
-            said = f"the true {name!r} leaves its limits {low:g} to {high:g} {where}"
+        is_beyond = ((x < low) | (x > high)).reshape(-1, x.shape[-1])
+        if is_beyond.any():
+            affected_runs = f"in {is_beyond.any(axis=1).sum()} of {len(is_beyond)} runs"
+            finding = f"the true {name!r} leaves its limits {low:g} to {high:g} {affected_runs}"
             remedy = "filters believe them, the plant's transition and noise have to keep them"
-            warnings.warn(f"{said}, first at step {np.argmax(beyond.any(axis=0))}: {remedy}", stacklevel=4)
+            warnings.warn(f"{finding}, first at step {np.argmax(is_beyond.any(axis=0))}: {remedy}", stacklevel=4)
 
 
 def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
@@ -172,7 +172,7 @@ def _check_counts(horizon: int, runs: int, chunk: int, first_run: int) -> None:
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
-    if check_count("first_run", first_run, 0) % BLOCK:
+    if check_count("first_run", first_run, least=0) % BLOCK:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
 
 
@@ -184,8 +184,8 @@ def _warn_of_numbers_lost_in_float32(network: Network) -> None:
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
     if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
-        said = "single precision: numbers of plant or sensors below 1.2e-38 count as 0; choose larger units, or float64"
-        warnings.warn(said, stacklevel=3)
+        finding = "single precision: numbers of plant or sensors below 1.2e-38 count as 0"
+        warnings.warn(f"{finding}; choose larger units, or float64", stacklevel=3)
 
 
 class _SimulationJob(Module):
@@ -295,7 +295,12 @@ def _simulate_outputs(job: _SimulationJob, runs: jax.Array) -> PyTree:
     with jax.enable_x64(False):  # so that JAX computes in single precision
         world, inputs = jax.tree.map(_convert_to_single, (job.world, job.inputs))
         outputs = _simulate_trajectories(world, inputs, job.key, runs)
-    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, outputs)
+
+    def to_double(leaf: jax.Array) -> jax.Array:
+        """Return real numbers in double precision, all else as it is."""
+        return leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(to_double, outputs)
 
 
 def _estimate_memory(job: _SimulationJob, runs: int, chunk: int) -> NeededMemory:
@@ -326,11 +331,12 @@ def group_by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     Each run goes to the next batch, and runs beyond the last batch (BATCHES) go on from the first: one row of batches,
     with what is beyond its end added to its begin.
     """
-    runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
-    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
-    row = jax.lax.dynamic_update_slice(row, values, (*zero, start))
-    begin, beyond = row[..., :BATCHES], row[..., BATCHES:]
-    return jax.lax.dynamic_update_slice(begin, begin[..., : runs - 1] + beyond, (*zero, 0))
+    *leading_axes, runs = values.shape
+    zeros = (0,) * len(leading_axes)  # the first index along all leading axes
+    row = jnp.zeros((*leading_axes, BATCHES + runs - 1), values.dtype)
+    row = jax.lax.dynamic_update_slice(row, values, (*zeros, start))
+    batches, beyond = row[..., :BATCHES], row[..., BATCHES:]
+    return jax.lax.dynamic_update_slice(batches, batches[..., : runs - 1] + beyond, (*zeros, 0))
 
 
 def _convert_to_single(leaf: PyTree) -> PyTree:
@@ -378,4 +384,5 @@ def simulate(
     Raises:
         ValueError: what `monte_carlo` refuses.
     """
-    return monte_carlo(network, horizon, 1, key, inputs=inputs, smooth=smooth).of_run(0)
+    record = monte_carlo(network, horizon, runs=1, key=key, inputs=inputs, smooth=smooth)
+    return record.of_run(0)

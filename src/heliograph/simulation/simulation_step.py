@@ -22,7 +22,7 @@ from heliograph.simulation.transmission.channel_draws import (
     number_memory_seeds,
     start_modes,
 )
-from heliograph.simulation.transmission.reception import AbstractMedium
+from heliograph.simulation.transmission.medium import AbstractMedium
 from straightline import present
 
 
@@ -39,11 +39,11 @@ class World(Module):
         A tuple: state x of the plant (n,); of the medium, which is all channels; of all filters; of the links between
         neighbours, by fusion; of the plant's memories, its modes.
         """
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         if isinstance(plant, ModalPlant) and plant.rates is not None:
             expected = "transitions of a plant's modes by steps (with rates filter recordings, simulate T = exp(G dt))"
             raise fail("simulation", expected, "rates of switches")
-        x = plant.sample_initial(draw_key(key, 0, WORLD, INITIAL))
+        x = plant.sample_initial(draw_key(key, k=0, source=WORLD, purpose=INITIAL))
         modes = start_modes(plant, key, self._memory_numbers)
         edges = {name: mesh.edges.init(key) for name, mesh in self.filters.meshes.items()}
         return x, self.medium.init(key), self.filters.init(), edges, modes

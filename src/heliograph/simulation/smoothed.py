@@ -115,22 +115,23 @@ def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) ->
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
         """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by kind."""
-        _, fused, _ = fusion.step((), estimates, jnp.asarray(0))
+        no_state, step_number = (), jnp.asarray(0)
+        _, fused, _ = fusion.step(no_state, estimates, step_number)
         return fused
 
     fused: dict[str, Estimate] = jax.vmap(fuse)(estimates)
     return fused
 
 
-def reduce_run(reducer: AbstractReducer[Result], later: NetworkSmoother | None, outputs: PyTree) -> OfStep:
+def reduce_run(reducer: AbstractReducer[Result], smoother: NetworkSmoother | None, outputs: PyTree) -> OfStep:
     """Return what a reducer makes of a run's `outputs` (time, ...); with a smoother, pairs: of filtered, of smoothed.
 
-    `later` smooths a whole run. The sums then end with those of the NIS, the normalised innovations squared, by which
-    the filters are tested.
+    `smoother` smooths a whole run. The sums then end with those of the NIS, the normalised innovations squared, by
+    which the filters are tested.
     """
-    if later is None:
+    if smoother is None:
         return reduce_rows(reducer, outputs)
-    results = later.smooth_run(outputs)
+    results = smoother.smooth_run(outputs)
     filtered, smoothed = reduce_rows(reducer, results["filtered"]), reduce_rows(reducer, results["smoothed"])
     return OfStep(
         sums=(filtered.sums, smoothed.sums, results["nis"]),
@@ -200,12 +201,17 @@ def select_smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon
 
 
 def _find_claim_of_smoother(filter: AbstractFilter) -> Claim:
-    """Return the claim of a filter's smoothed estimates, as a smoother step has it; only its shape is computed."""
+    """Return the claim of a filter's smoothed estimates, what their covariance promises, as a smoother step has it.
+
+    Only the shape of a step is computed, so that measurement and input may be zeros.
+    """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
-        _, step = eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
-    claim: Claim = step.claim
+        _, smoother_step = eqx.filter_eval_shape(
+            lambda filter, state: filter.step_with_smoother(state, z, u, k=0), filter, state
+        )
+    claim: Claim = smoother_step.claim
     return claim
 
 
@@ -237,9 +243,9 @@ def _warn_of_inconsistency(network: Network, nis: PyTree) -> None:
     The NIS, the normalised innovation squared, is about its number of components where a filter's claim is right.
     """
     for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
-        for f, name in enumerate(names):
-            for i, node in enumerate(network.groups[group]):
-                warn_if_inconsistent(f"{node}/{name}", np.asarray(sums[f, i]))
+        for filter_index, name in enumerate(names):
+            for node_index, node in enumerate(network.groups[group]):
+                warn_if_inconsistent(f"{node}/{name}", np.asarray(sums[filter_index, node_index]))
     for name, sums in nis["fused"].items():
         warn_if_inconsistent(f"{FUSED}/{name}", np.asarray(sums))
 
@@ -270,8 +276,8 @@ def add_truth(record: Record, plant: AnyPlant, truth: np.ndarray, smoothing: Abs
     def turn(estimate: Estimate, x: np.ndarray) -> Estimate:
         """Return an estimate with its angles within half a turn of those of the true state x, where x is known."""
         mean = np.asarray(estimate.mean)
-        known = np.where(np.isnan(x), mean, x)
-        return replace(estimate, mean=first(plant).near(mean, known))
+        truth_or_mean = np.where(np.isnan(x), mean, x)
+        return replace(estimate, mean=first(plant).near(mean, truth_or_mean))
 
     later = record.smoothed
     if later is not None and smoothing is not None:

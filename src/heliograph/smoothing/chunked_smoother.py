@@ -54,8 +54,10 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
-        begun = find_chunk_starts(SmootherStepRecursion(filter, 0), start, rows)
-        return None if begun is None else _smooth_all(SmootherStepRecursion(filter, begun.lengths.chunk), begun, rows)
+        chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
+        if chunk_starts is None:
+            return None
+        return _smooth_all(SmootherStepRecursion(filter, chunk_starts.lengths.chunk), chunk_starts, rows)
 
 
 def smooth_chunk(
@@ -118,10 +120,11 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
     window_ends = np.minimum(begun.first + own + ahead, total)
 
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
-        """Smooth the chunks `which`, filtered from these states; None without native code.
+        """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
-        They pass back from the end of their windows (their `own` rows and those that they look ahead); or, with
-        `later`, from the end of their own rows, where `later` is the smoothed law.
+        They pass back from the end of their `windows` (their `own` rows and those ahead; `window_ends`: the row behind
+        each); or, with `later`, from the end of their own rows, where `later` is the smoothed law. Closed over besides:
+        `recursion`, the filter's step; `begun.first`, the first row of each chunk.
         """
         first = begun.first[which]
         is_given = np.full(len(first), later is not None)
@@ -130,8 +133,8 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         else:
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
-        differs_by_chunk = [False, *[True] * 6]  # all arguments but the recursion
-        choice = choose_code(smooth_chunk, arguments, differs_by_chunk)
+        all_but_recursion = [False, True, True, True, True, True, True]
+        choice = choose_code(smooth_chunk, arguments, differs_by_run=all_but_recursion)
         return None if choice.code is None else choice.results()
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:
@@ -162,13 +165,14 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
     with which the chunk before it has to agree. Filtering begins in the state in which the chunk before ends, of the
     first one in that of `states`.
     """
-    wrong = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
-    for c in range(len(wrong) - 1, -1, -1):
-        if not wrong[c]:
+    disagrees_with_next = ~find_equal_states(take(results.entered, slice(None, -1)), take(results.left, slice(1, None)))
+    for chunk in range(len(disagrees_with_next) - 1, -1, -1):
+        if not disagrees_with_next[chunk]:
             continue
-        before, here, behind = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
-        state = take(results.end, before) if c else take(states, here)
-        replace_chunk(results, here, smooth(state, here, take(results.left, behind)))
-        if c:
-            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, here))
-            wrong[c - 1] = not agrees
+        before, after = slice(chunk - 1, chunk), slice(chunk + 1, chunk + 2)
+        this = slice(chunk, chunk + 1)
+        state = take(results.end, before) if chunk else take(states, this)
+        replace_chunk(results, this, smooth(state, this, take(results.left, after)))
+        if chunk:
+            (agrees,) = find_equal_states(take(results.entered, before), take(results.left, this))
+            disagrees_with_next[chunk - 1] = not agrees

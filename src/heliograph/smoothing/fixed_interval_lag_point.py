@@ -41,7 +41,7 @@ def nis_sums(steps: SmootherStep) -> Float[Array, "5"]:
 
 
 def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " time"]) -> Float[Array, "5"]:
-    """Return sums over blocks of steps of s, h, s^2, s h and h^2, s and h a block's sums of `nis` and of `received`.
+    """Return sum s, sum h, sum s^2, sum s h and sum h^2 over blocks of steps: s sums `nis` in a block, h `received`.
 
     `nis` is the square e' S^-1 e of each step's innovation, `received` the number of its components that arrived. The
     steps are cut into BLOCKS parts, whose scatter will tell the standard error.
@@ -49,7 +49,7 @@ def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " tim
     xp, time = library(nis), len(nis)
     count = min(BLOCKS, time)
     edges = [-(-time * i // count) for i in range(count + 1)]  # rounded up
-    s, h = (xp.stack([xp.sum(values[a:b]) for a, b in pairwise(edges)]) for values in (nis, received))
+    s, h = (xp.stack([xp.sum(values[begin:end]) for begin, end in pairwise(edges)]) for values in (nis, received))
     sums: Array = xp.stack([xp.sum(values) for values in (s, h, s * s, s * h, h * h)])
     return sums
 
@@ -145,7 +145,8 @@ class FixedLag(AbstractSmoothing):
     lag: int
 
     def __init__(self, lag: int):
-        self.lag = check_count("lag", lag, 0)
+        """Hold the lag: the number of later steps whose data each smoothed estimate uses."""
+        self.lag = check_count("lag", lag, least=0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time, ...)."""
@@ -165,7 +166,8 @@ class FixedPoint(AbstractSmoothing):
     step: int = eqx.field(static=True)
 
     def __init__(self, step: int):
-        self.step = check_count("step of a fixed point", step, 0)
+        """Hold the number of the one time step whose state is smoothed."""
+        self.step = check_count("step of a fixed point", step, least=0)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
         """Return the estimates (time from that step on, ...)."""

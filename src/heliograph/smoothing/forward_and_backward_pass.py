@@ -44,8 +44,9 @@ def smoother_steps(
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z, u = check_data(filter, measurements, inputs)
-    first = np.asarray(check_count("first step", first_step, 0))
-    return filter_rows_with_smoother_steps(filter, z, u, filter.init() if state is None else state, first)
+    first = np.asarray(check_count("first step", first_step, least=0))
+    start = filter.init() if state is None else state
+    return filter_rows_with_smoother_steps(filter, z, u, start, first)
 
 
 @compile_on_call
@@ -84,7 +85,8 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
     a row for each step.
     """
     zeros = jnp.zeros((len(inputs), filter.received))
-    steps: SmootherStep = filter_rows_with_smoother_steps(filter, zeros, inputs, filter.init(), np.asarray(0))[1]
+    steps: SmootherStep
+    _, steps = filter_rows_with_smoother_steps(filter, zeros, inputs, filter.init(), np.asarray(0))
     return steps
 
 
@@ -136,10 +138,14 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
         """
         ahead = times + lag - done
         before = jax.vmap(lambda step, law: step.back(law))(take_steps(steps, jnp.minimum(ahead, last)), later)
-        passed: Gaussian = jax.tree.map(
-            lambda a, b: jnp.where((ahead <= last).reshape(-1, *[1] * (a.ndim - 1)), a, b), before, later
-        )
-        return passed
+        is_step = ahead <= last
+
+        def choose(passed: jax.Array, unchanged: jax.Array) -> jax.Array:
+            """Return, for each step of `times`, the first array where there was a pass, else the second."""
+            return jnp.where(is_step.reshape(-1, *[1] * (passed.ndim - 1)), passed, unchanged)
+
+        chosen: Gaussian = jax.tree.map(choose, before, later)
+        return chosen
 
     # From the newest step that each one may use, as many steps back as the lag has.
     newest = take_steps(steps.end, jnp.minimum(times + lag, last))
@@ -161,10 +167,9 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
         return after, start.estimate_from(start.settle(later_step.find_law_of_earlier(after)))
 
     _, later = jax.lax.scan(body, start.start(), take_steps(steps, slice(step + 1, None)))
-    whole: Estimate = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]), start.estimate_from(start.after), later
-    )
-    return whole
+    filtered = start.estimate_from(start.after)
+    estimates: Estimate = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), filtered, later)
+    return estimates
 
 
 def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:

@@ -48,7 +48,8 @@ def simulation_smoother(
     rows, inputs = check_data(filter, z, u)
     if not len(rows):
         raise fail("measurements", "at least one row", "none")
-    keys = jax.random.split(jax.random.key(check_seed("seed", seed)), check_count("draws", draws))
+    key = jax.random.key(check_seed("seed", seed))
+    keys = jax.random.split(key, check_count("draws", draws))
     return np.asarray(_draw_paths(filter, rows, inputs, keys))
 
 
@@ -58,8 +59,8 @@ def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> 
     _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), np.asarray(0))
     if steps.before is None:
         raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
-    drawn: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
-    return drawn
+    paths: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
+    return paths
 
 
 def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
@@ -69,9 +70,9 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         """Draw the filter's state between two steps, given `later`, drawn after both; keep the plant's part of it."""
         previous, step, key = pair
         # The law of the state given the next one, which was drawn; means of attitudes are settled on their group.
-        left, manifold = step.before.left, step.manifold
+        state_before, manifold = step.before.left, step.manifold
         mean = step.before.mean_given(manifold.unsettle(step.before.ahead, later))
-        x = manifold.settle(left.mean, _draw_gaussian(left._replace(mean=mean), key))
+        x = manifold.settle(state_before.mean, _draw_gaussian(state_before._replace(mean=mean), key))
         return x, _take_plant_state(previous, x)
 
     last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))

@@ -94,7 +94,7 @@ def smooth_settled_chunks(
         return None
     arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
     differs_by_chunk = [False, False, False, True, True, True]  # means, rows and numbers of first rows
-    choice = choose_code(_smooth_settled, arguments, differs_by_chunk)
+    choice = choose_code(_smooth_settled, arguments, differs_by_run=differs_by_chunk)
     if choice.code is None:
         return None
     end, entered, left, estimates, nis = choice.results()

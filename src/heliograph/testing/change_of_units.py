@@ -19,8 +19,9 @@ from heliograph.filters.linear.scheduled_gains import LinearSystemFilter
 from heliograph.filters.linear.unconditional_mean import UnconditionalMean
 from heliograph.filters.modes.additive_links import AdditiveModalFilter
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern
+from heliograph.filters.modes.channel_by_mode import ChannelByMode
 from heliograph.filters.modes.finite_support_filter import AtomCombinations, MixtureFilter
-from heliograph.filters.modes.jump_linear_filter import ChannelByMode, ModalFilter
+from heliograph.filters.modes.jump_linear_filter import ModalFilter
 from heliograph.filters.modes.multiple_model import MultipleModelFilter
 from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.filters.modes.uncertain_chain import UncertainModalFilter

@@ -31,7 +31,6 @@ from straightline.llvm.vector_types_and_gathers import (
 )
 from straightline.lowering import Lowering, Value, turn_failures_into_refusals
 from straightline.nodes import Buffer, Loop, Node, Type, Unsupported
-from straightline.periodic_loop_values import reuse_recurring_values
 from straightline.program import (
     Program,
     SummedOutputs,
@@ -41,6 +40,7 @@ from straightline.program import (
     row_length_of_sums,
     sort_items_by_dependence,
 )
+from straightline.reuse_recurring_loop_values import reuse_recurring_values
 from straightline.rules.loops import copy_in_memory
 from straightline.rules.random_bits import write_hash_function
 from straightline.size_limits import LONGEST, TABLE

@@ -14,7 +14,7 @@ import numpy as np
 from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.event_table import EventTable
-from heliograph.files.sources.node_reading import Unread
+from heliograph.files.sources.message_reading import Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.numerics.check import InputError, error_text, fail
 

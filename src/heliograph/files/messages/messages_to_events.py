@@ -32,7 +32,7 @@ from heliograph.files.messages.own_format import (
     is_table_file,
 )
 from heliograph.files.sources.message_fields import parse_arrival
-from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.files.stores.store_address import is_store, parse_store
 from heliograph.files.stores.store_tables import StoreTable, query_store

@@ -10,7 +10,7 @@ from heliograph.files.event_columns import node_counts_losses
 from heliograph.files.event_table import EventTable
 from heliograph.files.messages.message_files import FileMessage, read_parquet_names
 from heliograph.files.sources.message_fields import convert_name
-from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.files.text.csv_dialects import NO_VALUE
 from heliograph.files.text.csv_text import read_csv_header
 from heliograph.files.text.text_file import CutOffError, find_extension

@@ -14,7 +14,7 @@ from .message_fields import match_topic as match_topic
 from .message_fields import parse_arrival as parse_arrival
 from .message_fields import parse_number as parse_number
 from .message_fields import parse_start as parse_start
-from .node_reading import Reading as Reading
-from .node_reading import Unread as Unread
+from .message_reading import Reading as Reading
+from .message_reading import Unread as Unread
 from .sources import SECOND as SECOND
 from .sources import Sources as Sources

@@ -17,8 +17,8 @@ from heliograph.files.sources.message_fields import (
     field_at,
     match_topic,
 )
+from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.files.sources.mixed_sender_detection import SenderCounter
-from heliograph.files.sources.node_reading import Reading, Unread
 from heliograph.files.sources.topic_clocks import TopicClocks
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusal_reasons import RefusedError

@@ -79,9 +79,9 @@ class EventFilter(AbstractSizedFilter):
         ages = max((other.ages for other in others if isinstance(other, EventFilter)), default=self.ages)
         if self.trigger.heartbeat is None or ages <= self.ages:
             return self
-        larger = copy(self)  # with what it knows of its world
-        object.__setattr__(larger, "ages", ages)
-        return larger
+        filter_with_room = copy(self)
+        object.__setattr__(filter_with_room, "ages", ages)  # fields are frozen
+        return filter_with_room
 
     @property
     def senders(self) -> list[slice]:
@@ -97,19 +97,21 @@ class EventFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> EventBelief:
         """Return the prior of (x, r), x the plant's state and r the reference of the sender: none was sent yet."""
-        start, m = at(self.plant, 0), self.outputs
+        start, m = at(self.plant, k=0), self.outputs
         x = from_covariance(start.initial_mean, start.initial_covariance)
-        both = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), WeightedColumns(np.eye(m), jnp.zeros(m)))
+        known_reference = WeightedColumns(np.eye(m), jnp.zeros(m))
+        joint = append_rows(x, jnp.zeros(m), jnp.zeros((m, len(start.states))), known_reference)  # r = 0
         counts = COUNTED if self.trigger.losses == "numbered" else 1
         label = jnp.zeros((len(self.senders), len(self.initial), self.ages, counts))
         label = label.at[:, :, 0, 0].set(jnp.asarray(self.initial))
-        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], both), label[None])
-        begun = jnp.full(len(self.senders), not self.trigger.needs_reference)
-        return EventBelief.from_sum(self._pad_sum(prior_sum), begun, jnp.asarray(False))
+        prior_sum = GaussianSum(jnp.zeros(1), jax.tree.map(lambda leaf: leaf[None], joint), label[None])
+        has_sent = jnp.full(len(self.senders), not self.trigger.needs_reference)
+        return EventBelief.from_sum(self._pad_sum(prior_sum), has_sent, jnp.asarray(False))
 
     def _pad_sum(self, one: GaussianSum) -> GaussianSum:
-        """Return a sum of one Gaussian, padded to the filter's number of Gaussians with copies of no weight."""
-        count = self._known_reference_count + (self.lost if self.reference_may_be_lost else 0)
+        """Return a sum of one Gaussian, padded with copies of weight zero to the filter's number of Gaussians."""
+        lost_references = self.lost if self.reference_may_be_lost else 0
+        count = self._known_reference_count + lost_references
         copies: GaussianSum = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), one)
         return copies._replace(log_weight=jnp.where(jnp.arange(count) == 0, one.log_weight[0], -jnp.inf))
 
@@ -157,24 +159,24 @@ class EventFilter(AbstractSizedFilter):
         plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         count = self.received - self.trigger.side_information(self.outputs)
         values, losses = z[:count], z[count:]
-        parts, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
+        mixture, begun, start = state.parts, state.begun, second_moments_at_start(self.plant)
         log_likelihood, differences, covariances = jnp.zeros(()), [], []
         # Senders one after the other, each with its value or its silence, given the senders before it.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
             lost = losses[s] if len(losses) else jnp.asarray(jnp.nan)
-            augmented = augment_by_signal(plant, sensor, self.transform, parts, start)
+            augmented = augment_by_signal(plant, sensor, self.transform, mixture, start)
             arrived = jnp.any(~jnp.isnan(received))
             after, expected, spread = self._condition_on_sender(augmented, channel, received, lost, s, begun[s])
             log_likelihood_of_sender = log_total_weight(after.log_weight)
             log_likelihood += log_likelihood_of_sender
-            parts = after.scale_weights(-log_likelihood_of_sender)
+            mixture = after.scale_weights(-log_likelihood_of_sender)
             # From now on the sender has a reference; where it is acknowledged, once a value arrived.
             begun = begun.at[s].set(begun[s] | (arrived if self.trigger.reference == "acknowledged" else True))
             differences.append(received - expected)
             covariances.append(spread)
         innovation = Innovation(*_append_losses(jnp.concatenate(differences), covariances, losses), log_likelihood)
-        return EventBelief.from_sum(parts, begun, state.moved), innovation
+        return EventBelief.from_sum(mixture, begun, state.moved), innovation
 
     def _condition_on_sender(
         self, augmented: GaussianSum, channel: ChannelByPattern, z: jax.Array, lost: jax.Array, s: int, begun: jax.Array
@@ -186,15 +188,12 @@ class EventFilter(AbstractSizedFilter):
         """
 
         def update_by_silence(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Update by silence of sender s; no value is expected: zeros in place of its mean and covariance."""
-            return (
-                self._condition_on_silence(augmented, channel, lost, s, begun),
-                jnp.zeros_like(z),
-                jnp.zeros((len(z), len(z))),
-            )
+            """Return the sum given silence of sender s; no value is expected, so zeros as its mean and covariance."""
+            after = self._condition_on_silence(augmented, channel, lost, s, begun)
+            return after, jnp.zeros_like(z), jnp.zeros((len(z), len(z)))
 
         def update_by_value(augmented: GaussianSum) -> tuple[GaussianSum, jax.Array, jax.Array]:
-            """Update by the value z."""
+            """Return the sum given the value z of sender s, and the value's predicted mean and covariance."""
             return self._condition_on_value(augmented, channel, z, lost, s, begun)
 
         used: tuple[GaussianSum, jax.Array, jax.Array] = jax.lax.cond(
@@ -239,10 +238,10 @@ class EventFilter(AbstractSizedFilter):
         """
         sender, state_and_reference = self.senders[s], np.arange(len(self.states) + self.outputs)
         inside = augmented.relabel_sender(s, labels.unsent + labels.forced if self.loses else labels.unsent)
-        pieces, _ = self.region.truncate_inside(inside, inside.select_range(0, 0), sender)
+        pieces, _ = self.region.truncate_inside(inside, inside.select_range(0, 0), sender)  # an empty sum beside it
         if self.loses:
             sent = augmented.relabel_sender(s, labels.dropped + labels.forced)
-            outside = self.region.truncate_outside(sent, sender, 1.0)
+            outside = self.region.truncate_outside(sent, sender, scale=1.0)
             pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
         return pieces.select_components(state_and_reference)
 
@@ -321,11 +320,11 @@ class EventFilter(AbstractSizedFilter):
 
         `sent`, `links`: the sum and the link's moments of each mode.
         """
-        signals = []
+        received_by_mode = []
         for sum_of_mode, link in zip(map(merge_groups, sent), links, strict=True):
             received = predict_received(sum_of_mode.gaussian, link, sender, self.outputs)
-            signals.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
-        return merge_groups(concatenate_sums(signals)).gaussian
+            received_by_mode.append(GaussianSum(sum_of_mode.log_weight, received, jnp.zeros((1, 1))))
+        return merge_groups(concatenate_sums(received_by_mode)).gaussian
 
     def _restrict_to_sent(self, used: GaussianSum, s: int, begun: jax.Array) -> GaussianSum:
         """Restrict each Gaussian to where its sender must send: |y - r| > delta, or anywhere at a heartbeat.
@@ -333,42 +332,45 @@ class EventFilter(AbstractSizedFilter):
         Returns one sum of the pieces outside, of a floor where these have next to no probability, and of those due.
         """
         waiting, due = self._split_label_by_sending(used.label[:, s], begun)
-        event = used.relabel_sender(s, waiting)
-        outside = self.region.truncate_outside(event, self.senders[s], 1 - RIM)  # RIM: for rounding
-        mass = jnp.max(outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0)
-        lowest = event.log_weight + np.log(FLOOR)  # FLOOR: least probability of sending, 1e-6
-        floor = event._replace(log_weight=jnp.where(mass < lowest, lowest, -jnp.inf))
+        before_event = used.relabel_sender(s, waiting)
+        outside = self.region.truncate_outside(before_event, self.senders[s], scale=1 - RIM)  # RIM: for rounding
+        log_mass_outside = jnp.max(
+            outside.log_weight.reshape(self.region.count_outside_parts(self.senders[s]), -1), axis=0
+        )
+        lowest = before_event.log_weight + np.log(FLOOR)  # FLOOR: least probability of sending, 1e-6
+        floor = before_event._replace(log_weight=jnp.where(log_mass_outside < lowest, lowest, -jnp.inf))
         return concatenate_sums([outside, floor, used.relabel_sender(s, due)])
 
     def _split_label_by_sending(self, label: jax.Array, begun: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split a sender's label (K, M, A, C) into steps where only |y - r| > delta sends, and where it must send."""
         heartbeat = self.trigger.heartbeat
         # A: steps since it sent. It must send at first (not begun), and at the heartbeat where there is one.
-        oldest = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
-        due = jnp.where(~begun | oldest, label, 0.0)
+        is_heartbeat = (jnp.arange(self.ages) == (-1 if heartbeat is None else heartbeat))[:, None]
+        due = jnp.where(~begun | is_heartbeat, label, 0.0)
         return label - due, due
 
     def _loss_probability(self, channel: ChannelByPattern, s: int) -> jax.Array:
         """Return the probability that what a sender transmits is lost, for each mode of the link (M,)."""
         components = self.senders[s] if len(self.senders) > 1 else slice(None)
-        lost = ~jnp.any(jnp.asarray(channel.present)[:, components], axis=1)  # by pattern of arrivals
-        return jnp.asarray(channel.chance) @ lost.astype(float)
+        is_lost = ~jnp.any(jnp.asarray(channel.present)[:, components], axis=1)  # by pattern of arrivals
+        return jnp.asarray(channel.chance) @ is_lost.astype(float)
 
     def _find_new_reference(self, sender: slice) -> np.ndarray:
         """Return the indices in (x, r, y) of the next (x, r): y in place of r for the components of the sender."""
         n, m = len(self.states), self.outputs
-        places: np.ndarray = np.r_[0 : n + m]
+        indices: np.ndarray = np.arange(n + m)
         if self.trigger.needs_reference:
-            places[n + sender.start : n + sender.stop] = n + m + np.r_[sender]
-        return places
+            # Of (x, r, y): r begins at n, y at n + m.
+            indices[n + sender.start : n + sender.stop] = np.arange(n + m + sender.start, n + m + sender.stop)
+        return indices
 
-    def _restore_if_impossible(self, parts: GaussianSum, before: GaussianSum) -> GaussianSum:
+    def _restore_if_impossible(self, mixture: GaussianSum, before: GaussianSum) -> GaussianSum:
         """Return the updated sum; where all its weights are 0, the sum `before` with FLOOR (1e-6) as likelihood."""
-        stays = before.select_components(np.arange(parts.gaussian.mean.shape[1]))
-        stays = stays._replace(log_weight=stays.log_weight + np.log(FLOOR))
-        forbidden = ~jnp.isfinite(log_total_weight(parts.log_weight))
-        either: GaussianSum = jax.tree.map(lambda x, y: jnp.where(forbidden, x, y), stays, parts)
-        return either
+        unchanged = before.select_components(np.arange(mixture.gaussian.mean.shape[1]))
+        unchanged = unchanged._replace(log_weight=unchanged.log_weight + np.log(FLOOR))
+        is_impossible = ~jnp.isfinite(log_total_weight(mixture.log_weight))
+        restored: GaussianSum = jax.tree.map(lambda old, new: jnp.where(is_impossible, old, new), unchanged, mixture)
+        return restored
 
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
@@ -381,10 +383,10 @@ class EventFilter(AbstractSizedFilter):
         return smoother_step_by_transform(self, step.map_states(self._merge_state), first(self.plant))
 
     def _merge_state(self, state: EventBelief) -> Gaussian:
-        """Merge the sum into one Gaussian of the plant's state."""
-        merged = take_leading(merge_groups(state.parts).gaussian, len(self.states))  # a stack of one
-        only: Gaussian = jax.tree.map(lambda leaf: leaf[0], merged)  # out of the stack
-        return only
+        """Merge the sum into one Gaussian of the plant's state, the first components of (x, r)."""
+        stack_of_one = take_leading(merge_groups(state.parts).gaussian, len(self.states))
+        x: Gaussian = jax.tree.map(lambda leaf: leaf[0], stack_of_one)
+        return x
 
 
 def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -392,5 +394,7 @@ def _append_losses(value: jax.Array, blocks: list[jax.Array], losses: jax.Array)
     loss_values = jnp.where(jnp.isnan(losses), jnp.nan, 0.0)
     value = jnp.concatenate([value, loss_values])
     arrived = ~jnp.isnan(value)
-    whole = jax.scipy.linalg.block_diag(*(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2))
-    return value, jnp.where(arrived[:, None] & arrived, whole, jnp.nan)
+    covariance = jax.scipy.linalg.block_diag(
+        *(jnp.nan_to_num(block) for block in blocks), jnp.zeros((len(losses),) * 2)
+    )
+    return value, jnp.where(arrived[:, None] & arrived, covariance, jnp.nan)

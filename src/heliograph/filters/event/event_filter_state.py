@@ -33,11 +33,11 @@ class EventBelief(NamedTuple):
         return GaussianSum(safe_log(self.weight), self.gaussian, self.label)
 
     @staticmethod
-    def from_sum(parts: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
+    def from_sum(mixture: GaussianSum, begun: jax.Array, moved: jax.Array) -> "EventBelief":
         """Return the state that holds a sum, with its weights themselves, since log 0 is no number to be stored.
 
         `begun`: which senders have sent; `moved`: whether a step was predicted already.
         """
         return EventBelief(
-            weight=jnp.exp(parts.log_weight), gaussian=parts.gaussian, label=parts.label, begun=begun, moved=moved
+            weight=jnp.exp(mixture.log_weight), gaussian=mixture.gaussian, label=mixture.label, begun=begun, moved=moved
         )

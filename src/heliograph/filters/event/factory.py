@@ -70,7 +70,7 @@ def event_filter(
     check_link(first(sensor), first(channel), len(start.states))
     refuse_angles("event filter", plant, sensor)
     trigger.check_outputs(len(first(sensor).outputs))
-    known, lost = check_count("known", known), check_count("lost", lost, 0)
+    known, lost = check_count("known", known), check_count("lost", lost, least=0)
     rule = Cubature() if transform is None else instance("transform", transform, AbstractTransform, "a transform")
     # Law of what arrives at each step, by mode of the link and by which components arrive.
     described, initial = _describe_channel(channel)
@@ -115,8 +115,8 @@ def _describe_channel(channel: Channel) -> tuple[ChannelByPattern | OverTime, np
         raise fail("channel of a sender with a trigger", "one that remembers by Markov chains", "one that drifts")
     steps = [joint_modes(step) for step in unstack(channel)]
     # One flag of probability 1 in each mode: nothing is told of the mode.
-    parts = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
-    return vary_over_steps(parts, channel), np.asarray(steps[0].initial)
+    by_pattern = describe_by_pattern(steps, np.ones((len(steps[0].initial), 1)))
+    return vary_over_steps(by_pattern, channel), np.asarray(steps[0].initial)
 
 
 def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger: StochasticTrigger | Periodic) -> Claim:
@@ -129,7 +129,7 @@ def _decide_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, trigger:
         return "nominal"
     if isinstance(trigger, Periodic):
         return lower_claim_by_noise("exact", plant, sensor, channel)
-    # Silence keeps a Gaussian one, where it is no hidden loss; that a value was sent must say nothing more than it.
+    # Given silence x stays Gaussian, unless a loss may hide there; given a value, if its being sent says nothing more.
     losses_are_hidden = trigger.losses == "unknown" and any(_may_lose_components(step) for step in steps)
     determined = all(_arrival_determines_y(step) for step in steps)
     is_exact = determined and _has_gaussian_noise(plant, sensor) and not losses_are_hidden
@@ -147,17 +147,16 @@ def _has_known_gain(channel: ChannelByPattern) -> bool:
 
 
 def _gain_and_noise_spread(channel: ChannelByPattern) -> np.ndarray:
-    """Return the spread of gain and noise by mode and pattern, zero where it is rounding of a known gain.
+    """Return the covariance of (G, n), z = G y + n, by mode and pattern of arrivals, zero where it is only rounding.
 
-    E[G G'] - M M' of a known gain M is not more than some eps of |M M'|.
-
-    G, n: gain and noise of z = G y + n, M = E G. `size` is |M M'|, padded by the constant's row and column, where it is
-    0.
+    With M = E G, the spread E[G G'] - M M' of a known gain comes out as some eps of |M M'|. `squared_gain`: |M M'|,
+    with a last row and column of zeros for n.
     """
     gain, spread = np.asarray(channel.mean)[..., :-1], np.asarray(channel.spread)
-    size = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
-    size = np.pad(size, [(0, 0)] * (size.ndim - 2) + [(0, 1)] * 2)
-    return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * size, 0.0, spread)
+    squared_gain = np.abs(gain[..., :, None, :, None] * gain[..., None, :, None, :])
+    leading_axes = squared_gain.ndim - 2
+    squared_gain = np.pad(squared_gain, [(0, 0)] * leading_axes + [(0, 1)] * 2)
+    return np.where(np.abs(spread) <= 100 * np.finfo(float).eps * squared_gain, 0.0, spread)
 
 
 def _has_gaussian_noise(*models: PyTree) -> bool:
@@ -175,11 +174,12 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
     # (mode, pattern) that can occur, of patterns in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
-        gain, rows = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
+        gain, arrives = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
         # Rows are scaled to 1, so that the rank does not depend on units.
-        size = np.abs(gain).max(axis=1, keepdims=True)
-        free = rows.all() and not np.any(_gain_and_noise_spread(channel)[j, a])
-        if not free or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < gain.shape[1]:
+        row_size = np.abs(gain).max(axis=1, keepdims=True)
+        scaled_gain = gain / np.where(row_size > 0, row_size, 1.0)
+        is_noise_free = arrives.all() and not np.any(_gain_and_noise_spread(channel)[j, a])
+        if not is_noise_free or np.linalg.matrix_rank(scaled_gain) < gain.shape[1]:
             return False
     return True
 
@@ -245,10 +245,11 @@ def _has_independent_losses(channel: ChannelByPattern) -> bool:
     m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
     if len(chance) > 1:
         return False
-    arrives = chance[0] @ np.asarray(channel.present)
-    product = np.prod(np.where(channel.present, arrives, 1 - arrives), axis=1)
+    arrival_probability = chance[0] @ np.asarray(channel.present)
+    chance_if_independent = np.prod(np.where(channel.present, arrival_probability, 1 - arrival_probability), axis=1)
     for a in np.flatnonzero(chance[0] > 0):
-        rows = channel.present[a]
-        if not np.array_equal(channel.mean[0, a][rows], np.eye(m, m + 1)[rows]) or np.any(channel.spread[0, a]):
+        arriving = channel.present[a]
+        is_unchanged = np.array_equal(channel.mean[0, a][arriving], np.eye(m, m + 1)[arriving])  # E[(G, n)] = (I, 0)
+        if not is_unchanged or np.any(channel.spread[0, a]):
             return False
-    return np.allclose(product, chance[0], rtol=0, atol=1e-12)
+    return np.allclose(chance_if_independent, chance[0], rtol=0, atol=1e-12)

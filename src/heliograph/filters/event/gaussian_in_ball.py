@@ -78,9 +78,12 @@ def _append_outer_tails(pieces: BallMoments, centre: jax.Array, variance: jax.Ar
     """
     tails = _truncate_component(centre[0], variance[0], radius, inside=False)
     mean = jnp.concatenate([tails.mean, jnp.broadcast_to(centre[1:], (2, len(centre) - 1))], axis=1)
-    free = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
-    outer_pieces = BallMoments(tails.log_mass, mean, covariance=free.at[:, 0, 0].set(tails.covariance[:, 0, 0]))
-    return BallMoments(*(jnp.concatenate(both) for both in zip(pieces, outer_pieces, strict=True)))
+    covariance = jnp.broadcast_to(jnp.diag(variance), (2, *variance.shape * 2))
+    covariance = covariance.at[:, 0, 0].set(tails.covariance[:, 0, 0])
+    outer_pieces = BallMoments(tails.log_mass, mean, covariance)
+    return BallMoments(
+        *(jnp.concatenate(pieces_and_tails) for pieces_and_tails in zip(pieces, outer_pieces, strict=True))
+    )
 
 
 def truncate_to_ball(parts: GaussianSum, directions: jax.Array, radius: jax.Array, inside: bool) -> GaussianSum:
@@ -128,13 +131,14 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
-        side, moments = jnp.ones(1), truncated_normal((edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation)
+        low, high = (edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation
+        sign, moments = jnp.ones(1), truncated_normal(low, high)
     else:
-        side = jnp.array([-1.0, 1.0])
-        # The lower tail is the upper one of -e: `side` turns it.
-        moments = upper_tail((radius - side * centre) / deviation)
+        sign = jnp.array([-1.0, 1.0])
+        # The lower tail of e is the upper one of -e.
+        moments = upper_tail((radius - sign * centre) / deviation)
     possible = jnp.isfinite(moments.log_mass)
-    mean = jnp.where(possible, centre + deviation * side * moments.mean, centre)
+    mean = jnp.where(possible, centre + deviation * sign * moments.mean, centre)
     spread = jnp.where(possible, variance * moments.variance, variance)
     return BallMoments(jnp.where(possible, moments.log_mass, -jnp.inf), mean[:, None], spread[:, None, None])
 
@@ -142,12 +146,13 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 def _join_pieces(pieces: BallMoments) -> BallMoments:
     """Return the moments of the mixture of pieces (piece, ...), each weighted by its mass; log of their whole mass."""
     # Masses relative to the largest one; where none has any, equal shares.
-    top = jnp.max(pieces.log_mass)
-    top = jnp.where(jnp.isfinite(top), top, 0.0)
-    weight = jnp.exp(pieces.log_mass - top)
+    largest = jnp.max(pieces.log_mass)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    weight = jnp.exp(pieces.log_mass - largest)
     total = jnp.sum(weight)
     share = jnp.where(total > 0, weight, 1.0) / jnp.where(total > 0, total, len(weight))
     mean = share @ pieces.mean
-    apart = pieces.mean - mean
-    covariance = jnp.tensordot(share, pieces.covariance + apart[:, :, None] * apart[:, None], axes=1)
-    return BallMoments(top + jnp.log(total), mean, covariance)
+    deviation = pieces.mean - mean
+    second = pieces.covariance + deviation[:, :, None] * deviation[:, None]  # about the mixture's mean
+    covariance = jnp.tensordot(share, second, axes=1)
+    return BallMoments(largest + jnp.log(total), mean, covariance)

@@ -38,11 +38,11 @@ class GaussianSum(NamedTuple):
 
         They need not sum to 1: their sum multiplies the Gaussian's weight. Where it is 0 the label stays.
         """
-        shape = (-1, *[1] * (label.ndim - 1))
+        beside_label = (-1, *[1] * (label.ndim - 1))
         total = jnp.sum(label, axis=tuple(range(1, label.ndim)))
-        share = label / jnp.where(total > 0, total, 1.0).reshape(shape)
-        share = jnp.where((total > 0).reshape(shape), share, self.label[:, s])
-        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(share))
+        normalised = label / jnp.where(total > 0, total, 1.0).reshape(beside_label)
+        normalised = jnp.where((total > 0).reshape(beside_label), normalised, self.label[:, s])
+        return self._replace(log_weight=self.log_weight + safe_log(total), label=self.label.at[:, s].set(normalised))
 
     def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
         """Multiply all weights by exp(log_factor)."""
@@ -76,103 +76,105 @@ def log_total_weight(log_weight: jax.Array) -> jax.Array:
 
     `log_weight` (K,); relative to the largest one, so that no exponential overflows.
     """
-    top = jnp.max(log_weight)
-    top = jnp.where(jnp.isfinite(top), top, 0.0)
-    return top + safe_log(jnp.sum(jnp.exp(log_weight - top)))
+    largest = jnp.max(log_weight)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    return largest + safe_log(jnp.sum(jnp.exp(log_weight - largest)))
 
 
-def concatenate_sums(parts: Sequence[GaussianSum]) -> GaussianSum:
+def concatenate_sums(sums: Sequence[GaussianSum]) -> GaussianSum:
     """Concatenate the Gaussians of several sums into one sum."""
-    every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    every: GaussianSum = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *sums)
     return every
 
 
 @jax.jit
-def truncate_between(parts: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
+def truncate_between(mixture: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
-    row, centre = _project_on_direction(parts, direction)
-    return _truncate(parts, centre, row, [jnp.broadcast_to(end, centre.shape) for end in (lower, upper)])
+    row, centre = _project_on_direction(mixture, direction)
+    return _truncate(mixture, centre, row, [jnp.broadcast_to(end, centre.shape) for end in (lower, upper)])
 
 
 @jax.jit
-def truncate_outside(parts: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
+def truncate_outside(mixture: GaussianSum, direction: jax.Array, edge: jax.Array) -> GaussianSum:
     """Truncate each Gaussian to d'x >= edge, and then each to d'x <= -edge: a sum of 2 K Gaussians.
 
-    `row`, `centre`: slopes and mean of d'x in each Gaussian.
+    `mean`, `slopes`: those of d'x in each Gaussian, x = m + L xi.
     """
-    row, centre = _project_on_direction(parts, direction)
+    slopes, mean = _project_on_direction(mixture, direction)
     # d'x <= -edge is (-d)'x >= edge: the second half is truncated with both signs turned.
-    edges = jnp.full(2 * len(centre), edge)
-    centre, row = jnp.concatenate([centre, -centre]), jnp.concatenate([row, -row])
-    return _truncate(concatenate_sums([parts, parts]), centre, row, [edges])
+    edges = jnp.full(2 * len(mean), edge)
+    mean, slopes = jnp.concatenate([mean, -mean]), jnp.concatenate([slopes, -slopes])
+    return _truncate(concatenate_sums([mixture, mixture]), mean, slopes, [edges])
 
 
-def _project_on_direction(parts: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _project_on_direction(mixture: GaussianSum, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the row f (K, N) of d'x = d'm + f xi, and d'm (K,)."""
-    return direction @ parts.gaussian.root, parts.gaussian.mean @ direction
+    return direction @ mixture.gaussian.root, mixture.gaussian.mean @ direction
 
 
-def _truncate(parts: GaussianSum, centre: jax.Array, row: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
+def _truncate(mixture: GaussianSum, centre: jax.Array, row: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
     """Truncate to where d'x = centre + row xi is above the first end, and below the second if there is one."""
-    log_mass, after = truncate_gaussians(parts.gaussian, centre, row, ends)
-    return GaussianSum(parts.log_weight + log_mass, after, parts.label)
+    log_mass, after = truncate_gaussians(mixture.gaussian, centre, row, ends)
+    return GaussianSum(mixture.log_weight + log_mass, after, mixture.label)
 
 
-def merge_groups(parts: GaussianSum, groups: int = 1) -> GaussianSum:
+def merge_groups(mixture: GaussianSum, groups: int = 1) -> GaussianSum:
     """Merge the sum by moment matching into `groups` Gaussians, each of one consecutive block (default: all)."""
-    few: GaussianSum = _merge_groups(parts, groups)
+    few: GaussianSum = _merge_groups(mixture, groups)
     return few
 
 
 @partial(jax.jit, static_argnames="groups")
-def _merge_groups(parts: GaussianSum, groups: int) -> GaussianSum:
+def _merge_groups(mixture: GaussianSum, groups: int) -> GaussianSum:
     """Merge the components of each group into one Gaussian: compiled body of `merge_groups`.
 
     Groups are consecutive and of equal size. A label, the probabilities of the sender's states, is averaged by weights.
     """
 
-    def merge_group(parts: GaussianSum) -> GaussianSum:
+    def merge_group(mixture: GaussianSum) -> GaussianSum:
         """Merge one group; where no component has weight, all count alike."""
-        total = log_total_weight(parts.log_weight)
+        total = log_total_weight(mixture.log_weight)
         # Weights relative to their sum, which has the logarithm `total`.
-        share = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+        share = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
         share = jnp.where(jnp.isfinite(total), share, 1 / len(share))
-        return GaussianSum(total, merge_mixture(parts.gaussian, share), jnp.tensordot(share, parts.label, axes=1))
+        return GaussianSum(total, merge_mixture(mixture.gaussian, share), jnp.tensordot(share, mixture.label, axes=1))
 
-    size = len(parts.log_weight) // groups
+    size = len(mixture.log_weight) // groups
     few: GaussianSum = jax.vmap(merge_group)(
-        jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), parts)
+        jax.tree.map(lambda leaf: leaf.reshape(groups, size, *leaf.shape[1:]), mixture)
     )
     return few
 
 
-def reduce_to_count(parts: GaussianSum, count: int, places: slice) -> GaussianSum:
+def reduce_to_count(mixture: GaussianSum, count: int, places: slice) -> GaussianSum:
     """Reduce to at most `count` Gaussians, merging the pair that is nearest in the components `places` each time.
 
-    The cost of a pair is w1 w2 / (w1 + w2) times its squared distance, of each component in units of its variances.
-
-    w1 and w2 are the weights of both, and `places` is a range of the vector's components.
+    The cost of a pair of weights w1 and w2 is w1 w2 / (w1 + w2) times its squared distance in a range of the vector's
+    components, each in units of its variances.
     """
-    while len(parts.log_weight) > count:
-        parts = _merge_cheapest_pair(parts, (places.start, places.stop))
-    return parts
+    while len(mixture.log_weight) > count:
+        mixture = _merge_cheapest_pair(mixture, (places.start, places.stop))
+    return mixture
 
 
 @partial(jax.jit, static_argnames="ends")
-def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
+def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int]) -> GaussianSum:
     """Return a sum of one Gaussian fewer: the cheapest pair (a, b) merged at a's place, the last one moved to b's.
 
     Cost of a pair: w_a w_b / (w_a + w_b) sum_i (m_a - m_b)_i^2 / (v_a + v_b)_i, w weight, m mean and v variance, over
     the components i from ends[0] to ends[1] - 1. It is how much the merged Gaussian spreads more than its parts, in
     units of their variance.
     """
-    size, places = len(parts.log_weight), slice(*ends)
+    size, places = len(mixture.log_weight), slice(*ends)
     pairs = list(combinations(range(size), 2))
     first, second = (jnp.asarray(column) for column in zip(*pairs, strict=True))
     # Weights over the largest one, so that not all of them underflow; where all are 0 there is no largest one.
-    top = jnp.max(parts.log_weight)
-    weight = jnp.exp(parts.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
-    centre, spread = parts.gaussian.mean[:, places], jax.vmap(lambda x: x.columns.diagonal)(parts.gaussian)[:, places]
+    top = jnp.max(mixture.log_weight)
+    weight = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
+    centre, spread = (
+        mixture.gaussian.mean[:, places],
+        jax.vmap(lambda x: x.columns.diagonal)(mixture.gaussian)[:, places],
+    )
     # Cost of each pair, and the pair of least cost. A pair of no spread or no weight is divided by 1, not by 0.
     w1, w2 = weight[first], weight[second]
     both = spread[first] + spread[second]
@@ -183,7 +185,7 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
     is_first = jnp.stack([jnp.any(chosen & (first == i)) for i in range(size)])
     is_second = jnp.stack([jnp.any(chosen & (second == i)) for i in range(size)])
     # The pair joined by its moments: a merge in which all others have no weight.
-    merged = merge_groups(parts._replace(log_weight=jnp.where(is_first | is_second, parts.log_weight, -jnp.inf)))
+    merged = merge_groups(mixture._replace(log_weight=jnp.where(is_first | is_second, mixture.log_weight, -jnp.inf)))
 
     def replace_pair(values: jax.Array, joined: jax.Array) -> jax.Array:
         """Return these numbers of the Gaussians after two of them are joined: one fewer.
@@ -195,5 +197,5 @@ def _merge_cheapest_pair(parts: GaussianSum, ends: tuple[int, int]) -> GaussianS
         with_last_moved = jnp.where(is_second.reshape(one_each), values[-1:], values)
         return jnp.where(is_first.reshape(one_each), joined, with_last_moved)[:-1]
 
-    fewer: GaussianSum = jax.tree.map(replace_pair, parts, merged)
+    fewer: GaussianSum = jax.tree.map(replace_pair, mixture, merged)
     return fewer

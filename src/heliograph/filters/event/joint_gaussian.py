@@ -19,7 +19,7 @@ from heliograph.factors.repeated_measurements import triangularise_noise
 from heliograph.filters.event.gaussian_sum import GaussianSum
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
-from heliograph.filters.gaussian.signal_moments import factor_gain_noise, find_signal_moments
+from heliograph.filters.gaussian.signal_moments import Signal, factor_gain_noise, find_signal_moments
 from heliograph.model.plant import AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.linalg import outer
@@ -43,55 +43,53 @@ class LinkMoments(NamedTuple):
 
 
 def augment_by_signal(
-    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, parts: GaussianSum, start: jax.Array
+    plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, mixture: GaussianSum, start: jax.Array
 ) -> GaussianSum:
     """Return each Gaussian of (x, r) as one of (x, r, y), y = h(x) + v; `start` (n,) is E[x_i^2] before any data.
 
     x: the plant's state, r: the value that a sender compares with y. E[x_i^2] sets the size of numbers that rounding
     acts on.
     """
-    n = len(start)
 
-    def augment_one(both: Gaussian) -> Gaussian:
-        """Append y, which depends on x alone, to one Gaussian.
+    def augment_one(joint: Gaussian) -> Gaussian:
+        """Return one Gaussian of (x, r, y) from that of (x, r)."""
+        signal = find_signal_moments(plant, sensor, transform, take_leading(joint, len(start)), start)
+        return _append_signal(joint, signal)
 
-        n: length of x; `start`: E[x_i^2] before any data, the size of numbers that rounding acts on.
-        """
-        signal = find_signal_moments(plant, sensor, transform, take_leading(both, n), start)
-        # No slope in the components behind x.
-        slopes = jnp.pad(signal.slopes, ((0, 0), (0, len(both.mean) - n)))
-        return append_rows(
-            both, signal.mean, slopes, triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-        )
+    return mixture._replace(gaussian=jax.vmap(augment_one)(mixture.gaussian))
 
-    return parts._replace(gaussian=jax.vmap(augment_one)(parts.gaussian))
+
+def _append_signal(joint: Gaussian, signal: Signal) -> Gaussian:
+    """Return the Gaussian of (x, r, y) from that of (x, r), `joint`: y = slopes x + noise, whatever r is."""
+    length_of_r = len(joint.mean) - signal.slopes.shape[1]
+    slopes = jnp.pad(signal.slopes, ((0, 0), (0, length_of_r)))
+    noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
+    return append_rows(joint, signal.mean, slopes, noise)
 
 
 def predict_with_reference(
-    plant: AbstractPlant, transform: AbstractTransform, both: Gaussian, u: jax.Array, start: jax.Array
+    plant: AbstractPlant, transform: AbstractTransform, joint: Gaussian, u: jax.Array, start: jax.Array
 ) -> Gaussian:
     """Return the Gaussian of (f(x, u) + w, r): r stays; `start` (n,) is E[x_i^2] before any data.
 
     r: the value that a sender compares with its signal. E[x_i^2] sets the size of numbers that rounding acts on.
     """
     n = len(start)
-    length_of_r = len(both.mean) - n
-    image = find_transition_moments(plant, transform, take_leading(both, n), u)
+    length_of_r = len(joint.mean) - n
+    image = find_transition_moments(plant, transform, take_leading(joint, n), u)
     noise = sum_unexplained(image, factor_process_noise(plant, u, start))
     # Rows of x by the slopes of f, rows of r as they are; noise of x alone.
-    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), both.root[n:]])
-    noise_of_both = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
-    mean = jnp.concatenate([image.mean + plant.noise_mean(), both.mean[n:]])
-    return from_columns(mean, join_columns(WeightedColumns(slopes, both.variances), noise_of_both))
+    slopes = jnp.concatenate([jnp.pad(image.slopes, ((0, 0), (0, length_of_r))), joint.root[n:]])
+    noise_of_joint = WeightedColumns(jnp.pad(noise.matrix, ((0, length_of_r), (0, 0))), noise.weights)
+    mean = jnp.concatenate([image.mean + plant.noise_mean(), joint.mean[n:]])
+    return from_columns(mean, join_columns(WeightedColumns(slopes, joint.variances), noise_of_joint))
 
 
 def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> Gaussian:
-    """Return the Gaussian with the components at `places` replaced by known values, of variance zero.
+    """Return the Gaussian with the components at `places` replaced by known values, independent of all others.
 
-    Covariance: root diag(variances) root'. A known component is a column of its own, of variance 0: its row of the root
-    is the row of the identity.
-
-    Components at `places` are taken as independent of the others.
+    With the covariance root diag(variances) root' a known component has a column of its own, of variance 0, and as
+    its row of the root that of the identity. The root is made lower triangular again.
     """
     root = x.root.at[places].set(np.eye(len(x.mean))[places])
     variances = x.variances.at[places].set(0.0)
@@ -99,7 +97,7 @@ def set_known_components(x: Gaussian, places: np.ndarray, values: jax.Array) -> 
 
 
 def condition_parts_on_received(
-    parts: GaussianSum,
+    mixture: GaussianSum,
     z: jax.Array,
     arrived: jax.Array,
     link: LinkMoments,
@@ -110,7 +108,7 @@ def condition_parts_on_received(
     """Return each Gaussian of (x, r, y) given z = G y + n, its weight multiplied by the density of z.
 
     Args:
-        parts: the sum over state x, reference r and signal y of the sender.
+        mixture: the sum over state x, reference r and signal y of the sender.
         z: what was received from the sender.
         arrived: which components of z arrived.
         link: moments of G and n.
@@ -118,22 +116,28 @@ def condition_parts_on_received(
         m: length of y.
         delivers: what arrives is y itself, all of it or nothing, so that y is known afterwards.
     """
-    size = parts.gaussian.mean.shape[1]
 
     def update_one(x: Gaussian) -> tuple[Gaussian, jax.Array]:
-        """Return one Gaussian given z, and log of the density of z.
+        """Return one Gaussian of (x, r, y) given z, and log of the density of z."""
+        return _condition_on_received(x, z, arrived, link, sender, m, delivers)
 
-        `arrived`: which of the sender's components arrived; `delivers`: the link hands on y itself, the last m
-        components of `size`.
-        """
-        expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
-        after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
-        if delivers:  # y is z, to the last digit
-            after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
-        return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
+    after, density = jax.vmap(update_one)(mixture.gaussian)
+    return GaussianSum(mixture.log_weight + density, after, mixture.label)
 
-    after, density = jax.vmap(update_one)(parts.gaussian)
-    return GaussianSum(parts.log_weight + density, after, parts.label)
+
+def _condition_on_received(
+    x: Gaussian, z: jax.Array, arrived: jax.Array, link: LinkMoments, sender: slice, m: int, delivers: bool
+) -> tuple[Gaussian, jax.Array]:
+    """Return one Gaussian x of (state, r, y) given z = G y + n, and log of the density of z.
+
+    Arguments as of `condition_parts_on_received`.
+    """
+    expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
+    after, innovations = condition_on_observation(x, slopes, z - expected, noise, arrived)
+    if delivers:  # y is z, to the last digit
+        size = len(x.mean)  # y are the last m components
+        after = set_known_components(after, np.arange(size - m, size)[sender], jnp.where(arrived, z, 0.0))
+    return after, innovations.log_density(arrived, jnp.abs(jnp.where(arrived, z, 0.0)))
 
 
 def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> Gaussian:
@@ -144,7 +148,7 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
     """
 
     def receive_one(x: Gaussian) -> Gaussian:
-        """Predict z from one Gaussian."""
+        """Return the Gaussian of z = G y + n from one Gaussian x of (state, r, y)."""
         expected, slopes, noise = _transform_by_link(x, link.select_sender(sender, m), m)
         return from_columns(expected, join_columns(WeightedColumns(slopes, x.variances), noise))
 
@@ -153,11 +157,12 @@ def predict_received(x: Gaussian, link: LinkMoments, sender: slice, m: int) -> G
 
 
 def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Array, jax.Array, WeightedColumns]:
-    """Return E z, slopes and noise of z = G y + n, y the last m components.
+    """Return E z, the slopes of z in xi and its noise for z = G y + n, y the last m components of x: centre + rows xi.
 
-    G y: the mean gain gives the slopes, its spread is noise. `second`: E[y y'].
+    The mean gain makes the slopes; the gain's spread about it is noise beside n.
     """
-    centre, rows, gain = x.mean[-m:], x.root[-m:], link.mean[:, :-1]
-    second = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
-    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second, centre))
-    return gain @ centre + link.mean[:, -1], gain @ rows, noise
+    centre, rows = x.mean[-m:], x.root[-m:]
+    gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
+    second_moment = WeightedColumns(rows, x.variances).covariance + outer(centre, centre)
+    noise = join_columns(link.noise, factor_gain_noise(link.gain_spread, second_moment, centre))
+    return gain @ centre + offset, gain @ rows, noise

@@ -81,7 +81,7 @@ class SilentRegion(NamedTuple):
         count = size * self.known
         return merge_groups(cut.select_range(0, count), self.known), cut.select_range(count)
 
-    def truncate_outside(self, parts: GaussianSum, sender: slice, scale: float) -> GaussianSum:
+    def truncate_outside(self, mixture: GaussianSum, sender: slice, scale: float) -> GaussianSum:
         """Truncate each Gaussian to |y - r| > scale delta, as `count_outside_parts` pieces, one after the other.
 
         Two pieces for each component: it is above or below, and those before it are inside. Of a ball these are what
@@ -93,14 +93,14 @@ class SilentRegion(NamedTuple):
         outside, errors = [], self._error_directions(sender)
         for i, (direction, delta) in enumerate(errors, 1):
             edge = scale * delta
-            outside.append(truncate_outside(parts, direction, edge))
+            outside.append(truncate_outside(mixture, direction, edge))
             if i < len(errors) or self.is_ball:
-                parts = truncate_between(parts, direction, -edge, edge)
+                mixture = truncate_between(mixture, direction, -edge, edge)
         if self.is_ball:
-            outside.append(self._truncate_to_ball(parts, sender, scale, inside=False))
+            outside.append(self._truncate_to_ball(mixture, sender, scale, inside=False))
         return concatenate_sums(outside)
 
-    def _truncate_to_ball(self, parts: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
+    def _truncate_to_ball(self, mixture: GaussianSum, sender: slice, scale: float, inside: bool) -> GaussianSum:
         """Truncate each Gaussian to |y - r| <= scale delta (`inside`), or to where it is more."""
         directions, deltas = zip(*self._error_directions(sender), strict=True)
-        return truncate_to_ball(parts, jnp.stack(directions), scale * deltas[0], inside)
+        return truncate_to_ball(mixture, jnp.stack(directions), scale * deltas[0], inside)

@@ -20,7 +20,8 @@ from heliograph.filters.gaussian.gaussian_prediction import (
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import Signal, factor_spread, find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern, append_flag
-from heliograph.filters.modes.multiple_model import correct_in_every_mode, replicate
+from heliograph.filters.modes.mixing import replicate
+from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
 from heliograph.model.centred_signal import predict_signal
 from heliograph.model.estimate import Estimate, Innovation
@@ -68,12 +69,8 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> StochasticBelief:
-        """Return the prior.
-
-        `law`: probabilities of the link's modes; `reference`: what the sender compares y with; `moved`: whether a step
-        was predicted.
-        """
-        start = at(self.plant, 0)
+        """Return the prior: of x, and of the link's modes (`law`); nothing was sent or predicted (`moved`) yet."""
+        start = at(self.plant, k=0)
         x = from_covariance(start.initial_mean, start.initial_covariance)
         return StochasticBelief(
             gaussian=x, law=jnp.asarray(self.initial), reference=jnp.zeros(self.outputs), moved=jnp.asarray(False)
@@ -86,13 +83,14 @@ class StochasticEventFilter(AbstractSizedFilter):
         The reference is what the sender compares its signal with.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
-        rows = jnp.asarray(at(self.channel, k).transition)
-        law = jnp.where(state.moved, state.law @ rows, state.law)  # at the first step the modes have their initial law
+        predicted = predict_gaussian(plant, self.transform, state.gaussian, u, second_moments_at_start(self.plant))
+        transition = jnp.asarray(at(self.channel, k).transition)
+        # At the first step the modes have their initial law.
+        law = jnp.where(state.moved, state.law @ transition, state.law)
         reference = state.reference
         if self.trigger.reference == "prediction":
             reference = self.predict_reference(state.gaussian.mean, u, k)
-        return StochasticBelief(gaussian=moved, law=law, reference=reference, moved=jnp.asarray(True))
+        return StochasticBelief(gaussian=predicted, law=law, reference=reference, moved=jnp.asarray(True))
 
     def predict_reference(self, mean: jax.Array, u: ArrayLike, k: Step) -> jax.Array:
         """Return the prediction of y at step k that both ends compute, from the mean after the step before and u."""
@@ -191,12 +189,13 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return mean gain (m, p) and spread (m, m, p+1, p+1) of the link, means over modes in which all arrives.
 
-        `law` (M,): probabilities of the modes; `chance`: of each pattern of arrivals by mode. The spread is that of (G,
-        n), z = G y + n.
+        The spread is that of (G, n) in z = G y + n; `law` (M,): probabilities of the modes. `joint_probability` (M,
+        patterns): of a mode and a pattern in which all arrives.
         """
-        whole = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
+        joint_probability = jnp.asarray(channel.chance) * jnp.all(jnp.asarray(channel.present), axis=1) * law[:, None]
         gain, spread = (
-            jnp.tensordot(whole, jnp.asarray(moment), 2) / jnp.sum(whole) for moment in (channel.mean, channel.spread)
+            jnp.tensordot(joint_probability, jnp.asarray(moment), 2) / jnp.sum(joint_probability)
+            for moment in (channel.mean, channel.spread)
         )
         return gain[:, :-1], spread
 
@@ -226,11 +225,10 @@ class StochasticEventFilter(AbstractSizedFilter):
     def _log_probability_sent(
         self, gain: jax.Array, signal: Signal, reference: jax.Array, value: jax.Array, covariance: jax.Array
     ) -> jax.Array:
-        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z.
+        """Return log P(sent | z) = log(1 - P(silent | z)), by the law of y given z; no less than log FLOOR, FLOOR 1e-6.
 
-        z = gain y + noise has the innovation `value`, of this covariance; silence is by y and the reference.
-
-        FLOOR: least probability, 1e-6. The noise is what the innovation's covariance has beside that of gain y.
+        z = gain y + noise has the innovation `value`, of this covariance; the noise is what it has beside that of
+        gain y. Silence depends on y and on the reference.
         """
         y = _law_of_signal(signal)
         slopes = gain @ y.root
@@ -244,8 +242,8 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> tuple[jax.Array, Gaussian]:
         """Return log P(silent), and x given silence: r = y + v, Cov v = W^-1, y = expected + slopes xi + noise.
 
-        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v, and
-        x = mean + L xi. The normaliser makes the density of r the probability of silence.
+        Silence of probability exp(-e' W e / 2), e = y - r, is as if the reference r were measured with the noise v,
+        and x = mean + L xi. The density of r times a constant (the normaliser) is the probability of silence.
         """
         noise = join_columns(noise, eliminate(self._inverse_weight()))
         after, innovations = condition_on_observation(x, slopes, reference - expected, noise)
@@ -264,7 +262,8 @@ class StochasticEventFilter(AbstractSizedFilter):
         outputs.
         """
         assert isinstance(self.trigger, StochasticTrigger)
-        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(self.trigger.matrix(self.outputs)))))
+        root = cholesky(self.trigger.matrix(self.outputs))
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
         return jnp.asarray((self.outputs * np.log(2 * np.pi) - log_det) / 2)
 
     def _condition_on_silence(

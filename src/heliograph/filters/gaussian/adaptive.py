@@ -90,7 +90,7 @@ class AdaptiveFilter(AbstractWrapper):
         PRIOR_SHAPE: the shape of that law, 3, as much as six noises say.
         """
         shape = jnp.full(self.received, PRIOR_SHAPE)
-        variance = jnp.diagonal(jnp.asarray(at(self.noise, 0).covariance))
+        variance = jnp.diagonal(jnp.asarray(at(self.noise, k=0).covariance))
         return AdaptiveBelief(self.base.init(), shape, shape * variance)
 
     @predicts
@@ -136,18 +136,16 @@ class AdaptiveFilter(AbstractWrapper):
         return variances
 
     def noise_deviations(self, state: AdaptiveBelief, k: Step = 0) -> Float[jax.Array, " outputs"]:
-        """Return deviations of the sensor's noise as they were learned, in units of its own, of each output.
+        """Return standard deviations of each output's noise as they were learned, in units of those of the model.
 
-        They are those of the noise that brings it, of several received numbers their root mean square; of an output
-        that none brings 1.
-
-        scale / shape of the inverse gamma law is the learned variance of each received number.
+        The root mean square over the received numbers that carry the output; 1 where none does. scale / shape of the
+        inverse gamma law is the learned variance of each received number.
         """
         noise = at(self.noise, k)
         ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
-        brings = jnp.asarray(noise.output)  # (m, p): 1 where number i brings output a
-        count = jnp.sum(brings, axis=0)
-        return jnp.sqrt(jnp.where(count > 0, brings.T @ ratio / jnp.maximum(count, 1), 1.0))
+        carries = jnp.asarray(noise.output)  # (m, p): 1 where received number i carries output a
+        count = jnp.sum(carries, axis=0)
+        return jnp.sqrt(jnp.where(count > 0, carries.T @ ratio / jnp.maximum(count, 1), 1.0))
 
 
 class VariationalUpdate(NamedTuple):
@@ -293,7 +291,7 @@ def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> Adaptiv
     if not isinstance(filter, GaussianFilter | RobustFilter):
         expected = "one of kalman_filter, extended_filter, cubature_filter or robust_filter"
         raise fail("filter to adapt", expected, type(filter).__name__)
-    stored = scalar("memory of an adaptive filter", memory, TINY, 1.0)
+    stored = scalar("memory of an adaptive filter", memory, low=TINY, high=1.0)
     noise = filter.noise if isinstance(filter, RobustFilter) else _find_sensor_noise(filter)
     adaptive = AdaptiveFilter(
         base=filter, noise=noise, memory=stored, claim="nominal", states=filter.states, inputs=filter.inputs,
@@ -306,8 +304,8 @@ def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """Return the sensor's noise as it arrives behind the filter's channel, for each step where these vary."""
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
-        """Return the noise of one step."""
-        return describe_outlier_noise(sensor.noise, None, channel, True)  # None: no outliers of a last hop
+        """Return the sensor's noise in the received numbers at one step, by its `channel`'s second moments."""
+        return describe_outlier_noise(sensed=sensor.noise, late=None, plain=channel, independent=True)
 
     noise: ReceivedNoise | OverTime = at_each_step(describe, filter.sensor, filter.channel)
     return noise

@@ -49,8 +49,9 @@ class DiffuseFilter(AbstractSizedFilter):
     def init(self) -> Diffuse:
         """Return the Gaussian before any data, with infinite variance in the state's unknown directions."""
         start = first(self.plant)
-        spread = start.initial_covariance
-        return start_diffuse(jnp.asarray(start.initial_mean), columns_of(spread.known), np.array(spread.unknown))
+        covariance = start.initial_covariance
+        finite, infinite_directions = columns_of(covariance.known), np.array(covariance.unknown)
+        return start_diffuse(jnp.asarray(start.initial_mean), finite, infinite_directions)
 
     @predicts
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
@@ -69,8 +70,9 @@ class DiffuseFilter(AbstractSizedFilter):
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
         after, observed = observe_diffuse(state, matrix, value, noise)
-        covariance, hears_unknown = project_diffuse(state, matrix)
-        innovation = jnp.where(hears_unknown, jnp.nan, value)
+        # H P H' of the known directions, and which components of H x depend on unknown ones too.
+        covariance, depends_on_unknown = project_diffuse(state, matrix)
+        innovation = jnp.where(depends_on_unknown, jnp.nan, value)
         present = ~jnp.isnan(innovation)
         total = jnp.where(present[:, None] & present, covariance + noise.covariance, jnp.nan)
         return after, Innovation(innovation, total, observed.log_likelihood)
@@ -85,8 +87,8 @@ class DiffuseFilter(AbstractSizedFilter):
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         noise = triangularise(factor_process_noise(plant, u, second_moments_at_start(self.plant)))
         predicted = jnp.asarray(step.prior.mean)
-        back = condition_on_next_diffuse(step.before, plant.transition_matrix(u), predicted, noise)
-        return SmootherStep(as_gaussian(step.after), back, claim=self.claim)
+        given_next = condition_on_next_diffuse(step.before, plant.transition_matrix(u), predicted, noise)
+        return SmootherStep(as_gaussian(step.after), given_next, claim=self.claim)
 
 
 def has_unknown_start(plant: AnyPlant) -> bool:

@@ -213,10 +213,10 @@ def mean_gain_filter(
 def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
-    """Return the Gaussian filter that another one stands on, refused behind a link of which anything is told.
+    """Return the Gaussian filter inside another filter; raise if the receiver is told anything of the link's state.
 
     Args:
-        name: of the other filter, in the refusal.
+        name: of the other filter, for the message.
         plant: the plant.
         sensor: its sensor.
         channel: from the sensor to the filter.

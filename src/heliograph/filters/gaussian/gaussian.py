@@ -100,10 +100,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the measurement; the points are redrawn from the prediction for both sides of the covariance.
+        """Correct with the measurement z; a transform draws its points of h(x) anew from the prediction.
 
-        `unknown`: the signal about its mean, where gain and covariance depend on no data (all is linear). `settle` puts
-        attitudes on their group again.
+        `unknown`: the signal about its mean, where gain and covariance depend on no data (all is linear). `settle`
+        puts attitudes on their group again.
         """
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
         unknown = signal.about_mean() if self.linear else signal

@@ -100,17 +100,17 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
     `start`: whose law of the first state counts, by default the plant's; of a law that is partly unknown, the known
     part. A noise that depends on inputs counts where it is added.
     """
-    first_step = at(plant, 0)
+    first_step = at(plant, k=0)
     if isinstance(first_step, ModalPlant):  # the largest of the models
         return reduce(jnp.maximum, [second_moments_at_start(model, start) for model in first_step.models])
     start = first_step if start is None else start
     mean = jnp.asarray(start.initial_mean)
-    spread = start.initial_covariance
-    known = spread.known if isinstance(spread, UnknownStart) else spread
-    size = mean * mean + diagonal(known)
+    initial_covariance = start.initial_covariance
+    known_covariance = initial_covariance.known if isinstance(initial_covariance, UnknownStart) else initial_covariance
+    second_moments = mean * mean + diagonal(known_covariance)
     if isinstance(first_step.noise, AbstractNoise):
-        size = size + diagonal(first_step.noise.covariance)
-    return jnp.asarray(size)
+        second_moments = second_moments + diagonal(first_step.noise.covariance)
+    return jnp.asarray(second_moments)
 
 
 def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -> WeightedColumns:
@@ -118,8 +118,9 @@ def factor_process_noise(plant: AbstractPlant, u: jax.Array, start: jax.Array) -
 
     Numbers of second moments s have a rounding of some eps^2 s as variance: so no covariance is singular by rounding.
     """
-    w = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
-    joined = join_columns(w, rounding_of(start + diagonal(plant.noise_covariance(u))))
+    noise = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
+    rounding = rounding_of(start + diagonal(plant.noise_covariance(u)))
+    joined = join_columns(noise, rounding)
     factors: WeightedColumns = keep_for_derivatives(triangularise(joined))
     return factors
 
@@ -154,10 +155,9 @@ def transform_about_mean(
 ) -> tuple[jax.Array, Image]:
     """Return the state about which moments of f(x, u) are taken, and these moments; of attitudes it is their mean.
 
-    The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean change
-    from m_i: the error shrinks by the square of the attitudes' deviation in each.
-
-    MEAN_STEPS: 4 such steps are taken.
+    The mean of attitudes m is where changes from it have the mean 0. m_0 = f(m, u), m_(i+1) = m_i plus the mean
+    change from m_i, in MEAN_STEPS (4) steps: each multiplies the error by about the square of the attitudes'
+    deviation.
     """
     # Only attitudes have a mean that must be searched; a transform that keeps the centre stays at f(m, u).
     middle = jnp.asarray(plant.transition(x.mean, u)) if plant.attitude else x.mean
@@ -179,14 +179,13 @@ class PredictsByTransform(Protocol):
 def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasInitialMoments) -> SmootherStep:
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
-    `start`: the plant or filter from whose initial law rounding is counted.
-
-    `rest`: covariance of x+ that the slopes in x do not explain.
+    `start`: the plant or filter from whose initial law rounding is counted. `unexplained`: covariance of x+ given x,
+    which the slopes of f in x do not explain.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)
-    rest = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
-    return smoother_step_of(step, (image.slopes, rest), filter.claim, plant.manifold)
+    unexplained = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
+    return smoother_step_of(step, (image.slopes, unexplained), filter.claim, plant.manifold)
 
 
 def choose_initial_moments(
@@ -195,10 +194,11 @@ def choose_initial_moments(
     """Return initial mean (n,) and covariance (n, n), the plant's where None is given, and whether any was given."""
     n = len(plant.states)
     mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    spread = plant.initial_covariance
+    initial = plant.initial_covariance
     if initial_covariance is not None:
-        spread = covariance("filter's initial covariance", initial_covariance, n)
-    return mean, spread, initial_mean is not None or initial_covariance is not None
+        initial = covariance("filter's initial covariance", initial_covariance, n)
+    is_given = initial_mean is not None or initial_covariance is not None
+    return mean, initial, is_given
 
 
 class OpenLoop(AbstractGaussianStateFilter):

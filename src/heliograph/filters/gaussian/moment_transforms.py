@@ -53,9 +53,8 @@ class AbstractTransform(Module):
             raise unwritten(self, "apply")
         x = from_covariance(mean, covariance)
         image = self.image(function, x)
-        # Cov(x, f)
-        cross = (x.root * x.variances) @ image.slopes.T
-        return Transformed(image.mean, image.columns.covariance, cross)
+        cross_covariance = (x.root * x.variances) @ image.slopes.T
+        return Transformed(image.mean, image.columns.covariance, cross_covariance)
 
     def image(self, function: Function, x: Gaussian) -> Image:
         """Return the moments of f(x) as slopes in xi of x = m + L xi, and a rest uncorrelated with xi.
@@ -71,8 +70,8 @@ def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     Slopes: (D^-1 L^-1 Cov(x, f))'; the curvature is Cov f less slopes D slopes'.
     """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
-    rest = moments.covariance - (slopes * x.variances) @ slopes.T
-    return image_by_slopes(moments.mean, slopes, x, eliminate(rest))
+    unexplained = moments.covariance - (slopes * x.variances) @ slopes.T
+    return image_by_slopes(moments.mean, slopes, x, eliminate(unexplained))
 
 
 class Cubature(AbstractTransform):
@@ -155,6 +154,7 @@ class PolynomialMoments(AbstractTransform):
     degree: int = eqx.field(static=True)
 
     def __init__(self, degree: int):
+        """Hold the degree of the polynomials whose moments are taken exactly."""
         self.degree = check_count("degree of the polynomial", degree)
 
     def image(self, function: Function, x: Gaussian) -> Image:
@@ -168,9 +168,9 @@ class PolynomialMoments(AbstractTransform):
         center = values @ weights
         slopes = (values * weights) @ points  # in units of each deviation
         # What f has beside its best linear fit, at each point.
-        rest = values - center[:, None] - slopes @ points.T
+        residuals = values - center[:, None] - slopes @ points.T
         explained = WeightedColumns(slopes, np.ones(len(deviations)))
-        return Image(center, explained, deviations, eliminate(WeightedColumns(rest, weights).covariance))
+        return Image(center, explained, deviations, eliminate(WeightedColumns(residuals, weights).covariance))
 
 
 def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, deviations: jax.Array) -> Image:
@@ -183,12 +183,13 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     rows, columns = np.triu_indices(n, 1)
     points = [center, center + factor, center - factor, center + factor[:, rows] + factor[:, columns]]
     values = evaluate_at_points(function, jnp.concatenate(points, axis=1).T).T
-    start, ahead, behind, both = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
-    slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start
-    mixed = both - ahead[:, rows] - ahead[:, columns] + start
+    start, ahead, behind, cross = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
+    slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start  # a_i and b_i
+    mixed = cross - ahead[:, rows] - ahead[:, columns] + start  # b_ij
     weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
     curvature = WeightedColumns(jnp.concatenate([squares, mixed], axis=1), weights)
-    return Image(start[:, 0] + jnp.sum(squares, axis=1), WeightedColumns(slopes, np.ones(n)), deviations, curvature)
+    f_mean = start[:, 0] + jnp.sum(squares, axis=1)
+    return Image(f_mean, WeightedColumns(slopes, np.ones(n)), deviations, curvature)
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -200,4 +201,5 @@ def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
         raise fail("points of the exact-moment rule", f"at most {POINT_LIMIT:,}", f"{count}^{dimension}")
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)
     grid = np.array(list(product(nodes, repeat=dimension)))
-    return grid, np.array([np.prod(w) for w in product(weights / weights.sum(), repeat=dimension)])
+    probabilities = weights / weights.sum()
+    return grid, np.array([np.prod(w) for w in product(probabilities, repeat=dimension)])

@@ -144,8 +144,9 @@ class CentredFilter(AbstractWrapper):
         The state is a center (`high`) and a Gaussian of small deviations about it. `compensate` evaluates a function
         with the rest that rounding takes (`low`); `unit`: eps of the precision.
         """
-        plant, center, u = at(self.base.plant, k), jnp.asarray(state.high), jnp.asarray(u)
-        unit, x = unit_of(center), state.about_center
+        plant, u = at(self.base.plant, k), jnp.asarray(u)
+        center, x = jnp.asarray(state.high), state.about_center
+        unit = unit_of(center)
         if isinstance(plant, LinearPlant):
             # F (c + e) = (F c, in two parts) + F e.
             center_after = compensate(lambda c: plant.transition_matrix(u) @ c, unit)(Compensated(center))
@@ -201,12 +202,9 @@ def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFi
     base: Any = filter
     if not isinstance(first(base.plant), AbstractPlant) or first(base.plant).attitude:
         return filter
-    centred = CentredFilter(
-        base=base,
-        known_gain=all(not np.any(c.gain_spread) and not c.uncertain for c in unstack(base.channel)),
-        **make_sizes(base.claim, base, base.received),
-    )
-    return with_premise(centred, base.premise)
+    has_known_gain = all(not np.any(step.gain_spread) and not step.uncertain for step in unstack(base.channel))
+    about_origin = CentredFilter(base=base, known_gain=has_known_gain, **make_sizes(base.claim, base, base.received))
+    return with_premise(about_origin, base.premise)
 
 
 def _start_at_zero(base: Any) -> Any:

@@ -92,10 +92,10 @@ class GivingInFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> GateAndRival:
-        """Return the belief before any data.
+        """Return the belief before any data: gate and rival alike, nothing refused.
 
-        The rival is the state that explains what the gate refuses; counts and evidence begin at 0. NEVER: -1, the gate
-        has not given in yet.
+        The rival is the state that explains what the gate refuses. `step`: when the gate last gave in; NEVER (-1):
+        not yet.
         """
         start, zero = self.base.init(), jnp.zeros(())
         return GateAndRival(
@@ -117,8 +117,8 @@ class GivingInFilter(AbstractSizedFilter):
         """
         elapsed = state.elapsed
         if TIME_STEP in self.inputs:
-            passes = jnp.asarray(u, dtype=float)[self.inputs.index(TIME_STEP)]
-            elapsed = jnp.where(jnp.any(state.refused > 0), elapsed + passes, 0.0)
+            time_step = jnp.asarray(u, dtype=float)[self.inputs.index(TIME_STEP)]
+            elapsed = jnp.where(jnp.any(state.refused > 0), elapsed + time_step, 0.0)
         believed, rival = (self.base.predict(x, u, k) for x in (state.believed, state.rival))
         return state._replace(believed=believed, rival=rival, elapsed=elapsed)
 
@@ -163,8 +163,7 @@ class GivingInFilter(AbstractSizedFilter):
         """Return whether a number has been refused for long enough in a row: often enough, or over enough time.
 
         `refused`: of each received number, its refusals in a row (m,); `elapsed`: time since the first of them.
-
-        `after`, `seconds`: the limits of the gate's rule, None where it has none.
+        `after`, `seconds`: limits of the gate's rule, None where it has none.
         """
         is_long = jnp.zeros((), dtype=bool)
         if self.after is not None:
@@ -221,21 +220,21 @@ class GivingInFilter(AbstractSizedFilter):
     def remark(self, state: GateAndRival) -> Remark:
         """Say how often the gate has given in, when it last did, and which states moved how far then.
 
-        `given_in`: how often; `step`: number of the last time; `moved`: by how much each state jumped then.
+        `given_in`: how often; `step`: number of the last time; `jumps`: by how much each state jumped then.
         """
-        times = int(state.given_in)
-        if not times:
+        count = int(state.given_in)
+        if not count:
             return Remark()
-        moved = ", ".join(f"{name} by {far:.3g}" for name, far in zip(self.states, state.moved.tolist(), strict=True))
-        often = "once" if times == 1 else f"{times} times"
-        return Remark(times, f"the gate gave in {often}, last in row {int(state.step) + 1}, and moved {moved}")
+        jumps = ", ".join(f"{name} by {jump:.3g}" for name, jump in zip(self.states, state.moved.tolist(), strict=True))
+        how_often = "once" if count == 1 else f"{count} times"
+        return Remark(count, f"the gate gave in {how_often}, last in row {int(state.step) + 1}, and moved {jumps}")
 
 
 def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of_state: jax.Array) -> jax.Array:
     """Return the most probable change of the state that explains each innovation: Cov(x, t_i) e_i / V_i, (n, m).
 
-    n states, m received numbers; t: their values without noise; V_i (`of_state`): the variance of t_i, 0 where nothing
-    of the state is in it.
+    n states, m received numbers, t their values without noise; `of_state` holds V_i, the variance of t_i by the
+    state's, 0 where t_i does not depend on it.
     """
     prior = predicted.prior
     cross = prior.root @ (prior.variances[:, None] * predicted.slopes.T)

@@ -50,7 +50,8 @@ class Huber(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']" = 1.345):
-        self.c = scalar("constant of Huber's rule", c, TINY)
+        """Hold c, the normalised innovation |d| beyond which a measurement's weight falls as c / |d|."""
+        self.c = scalar("constant of Huber's rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return min(1, c / |d|)."""
@@ -67,7 +68,8 @@ class InverseMultiquadric(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']" = 3.0):
-        self.c = scalar("constant of the inverse multiquadric rule", c, TINY)
+        """Hold c, the normalised innovation |d| at which the weight 1 / (1 + d^2 / c^2) is a half."""
+        self.c = scalar("constant of the inverse multiquadric rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return 1 / (1 + d^2 / c^2)."""
@@ -83,7 +85,8 @@ class WoLF(AbstractWeightingRule):
     c: Number
 
     def __init__(self, c: "Float[ArrayLike, '']"):
-        self.c = scalar("constant of the weighted likelihood filter", c, TINY)
+        """Hold c, the innovation in deviations of the noise at which the weight 1 / (1 + e^2 / (c^2 r)) is a half."""
+        self.c = scalar("constant of the weighted likelihood filter", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
         """Return 1 / (1 + e^2 / (c^2 r))."""
@@ -108,9 +111,9 @@ class Gate(AbstractWeightingRule):
 
     def __init__(self, c: "Float[ArrayLike, '']" = 9.0, after: int | None = None, seconds: float | None = None):
         """Keep c, the limit of a squared innovation over its variance, and when the gate gives in (None: never)."""
-        self.c = scalar("limit of the gate", c, TINY)
+        self.c = scalar("limit of the gate", c, low=TINY)
         self.after = None if after is None else check_count("after, of a gate", after)
-        self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, TINY))
+        self.seconds = None if seconds is None else float(scalar("seconds of a gate", seconds, low=TINY))
 
     @property
     def gives_in(self) -> bool:
@@ -135,16 +138,14 @@ class StudentVB(AbstractWeightingRule):
     degrees: Degrees
 
     def __init__(self, iterations: int = 4):
+        """Hold the number of variational updates; the filter that uses the rule fills in the degrees of freedom nu."""
         self.iterations = check_count("iterations of variational Bayes", iterations)
         self.degrees = np.zeros(0)
 
     def of_law(self, degrees: Degrees) -> "StudentVB":
-        """Return the same rule with the degrees of each received component.
-
-        Degrees of Student's law, one for each.
-        """
+        """Return the same rule with the degrees of freedom of each received component's Student law."""
         rule = StudentVB(self.iterations)
-        object.__setattr__(rule, "degrees", degrees)
+        object.__setattr__(rule, "degrees", degrees)  # fields are frozen
         return rule
 
     def iterate(
@@ -152,17 +153,17 @@ class StudentVB(AbstractWeightingRule):
     ) -> tuple[jax.Array, jax.Array]:
         """Return the weights (m,) of the last of `iterations` updates, and those that it would give the next one.
 
-        w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1.
-
-        e: innovations; t: what z has of the state, its mean subtracted; a weight divides the variance of a noise.
+        w_i = (nu + 1) / (nu + E[(e_i - t_i)^2] / r_i) for nu degrees and noise of variance r_i, from weights of 1. e:
+        innovations; t: the part of e that is the state's. A weight divides the variance of a noise.
         """
         variance = noise.diagonal
-        used = following = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
+        weights = next_weights = jnp.broadcast_to(jnp.ones_like(variance), e.shape)
         for _ in range(self.iterations):
-            used = following
-            residual = expected_squared_residuals(before, divide_noise_by_weights(noise, used), e, present)
-            following = (jnp.asarray(self.degrees) + 1) / (jnp.asarray(self.degrees) + residual / variance)
-        return used, following
+            weights = next_weights
+            residual = expected_squared_residuals(before, divide_noise_by_weights(noise, weights), e, present)
+            nu = jnp.asarray(self.degrees)
+            next_weights = (nu + 1) / (nu + residual / variance)
+        return weights, next_weights
 
 
 class RobustFilter(AbstractGaussianStateFilter):
@@ -193,14 +194,14 @@ class RobustFilter(AbstractGaussianStateFilter):
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
         """Use what arrived of the measurement, component after component or with weights.
 
-        `rule`: how weights are given to components; None to use the noise's law itself, a mixture of Gaussian branches.
-        `sensed`: the sensor's mean signal, on which the law may depend.
+        `rule`: how weights are given to components; None to use the noise's law itself, a mixture of Gaussian
+        branches. `sensor_mean`: mean of the sensor's signal, on which the law may depend.
         """
-        before, sensed = self.predict_received(state, k)
+        before, sensor_mean = self.predict_received(state, k)
         z = wrap_near(jnp.asarray(z), before.signal, self.received_angles)
         noise = at(self.noise, k)
         if self.rule is None:
-            law = noise.find_branches(sensed)
+            law = noise.find_branches(sensor_mean)
             after = update_by_score(before, z, law)
             center, variance = law.mean_and_variance()
             return after.state, _innovation_about_mean(before, z, center, jnp.diag(variance), after, by_law=True)
@@ -214,9 +215,8 @@ class RobustFilter(AbstractGaussianStateFilter):
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
         """Predict what would arrive without the noise that may hold outliers; return the sensor's mean signal too."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        signal = signal_without_noise(
-            at(self.plant, k), sensor, self.transform, state, second_moments_at_start(self.plant, self)
-        )
+        start = second_moments_at_start(self.plant, self)
+        signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, start)
         return predict_behind_channel(signal, channel), signal.mean
 
 
@@ -227,7 +227,8 @@ def signal_without_noise(
 
     `start`: E[x_i^2] before any data (n,), the size of numbers that rounding acts on.
     """
-    return find_signal_moments(plant, sensor, transform, state, start, zero_covariance(len(sensor.outputs)))
+    no_noise = zero_covariance(len(sensor.outputs))
+    return find_signal_moments(plant, sensor, transform, state, start, no_noise)
 
 
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
@@ -237,7 +238,8 @@ def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMea
     """
     gain = jnp.asarray(channel.mean_gain)
     mean = gain @ signal.mean + channel.offset
-    return PredictedMeasurement(signal.prior, mean, gain @ signal.slopes, make_received_noise(signal, channel))
+    slopes, noise = gain @ signal.slopes, make_received_noise(signal, channel)
+    return PredictedMeasurement(signal.prior, mean, slopes, noise)
 
 
 def _innovation_about_mean(

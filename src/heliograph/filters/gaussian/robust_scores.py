@@ -118,14 +118,15 @@ class AbstractWeightingRule(Module):
     def iterate(
         self, before: PredictedMeasurement, noise: WeightedColumns, e: jax.Array, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the weights of the update, and those to report, for noise of m components.
+        """Return the weights of the update, and those to report: the same for a rule that takes one step.
 
-        Both are the same for a rule that takes one step. The squares are relative: e^2 over its variance, noise
-        included.
+        They are functions of the innovations e, of e^2 over its variance, noise included, and of the noise's
+        variance.
         """
         scale = noise.diagonal
-        w = self.weights(e, e**2 / (before.columns.diagonal + scale), scale)
-        return w, w
+        squared = e**2 / (before.columns.diagonal + scale)
+        weights = self.weights(e, squared, scale)
+        return weights, weights
 
 
 def update_with_weights(
@@ -133,20 +134,18 @@ def update_with_weights(
 ) -> ScoreUpdate:
     """Return one joint update by all of z (m,), its noise r_ij divided by sqrt(w_i w_j) with the weights w of a rule.
 
-    SMALLEST: the weight (1e-200) up to which a component counts as missing.
-
     Args:
         before: prediction of z without its noise.
         z: what was received, NaN where a component did not arrive.
         center: mean of the noise (m,).
         noise: columns of the noise's covariance r.
-        rule: weighs the components. Those of weight zero are left out.
+        rule: weighs the components. Those with a weight up to SMALLEST, 1e-200, count as missing.
     """
     arrived = ~jnp.isnan(z)
-    e = jnp.where(arrived, z - before.signal - center, 0.0)
+    innovation = jnp.where(arrived, z - before.signal - center, 0.0)
     # A rule that iterates has weights of its last update, and newer ones that follow from it, which are reported.
-    w, reported_weights = rule.iterate(before, noise, e, arrived)
-    after = joint_update(before, e, arrived & (w > SMALLEST), divide_noise_by_weights(noise, w))
+    weights, reported_weights = rule.iterate(before, noise, innovation, arrived)
+    after = joint_update(before, innovation, arrived & (weights > SMALLEST), divide_noise_by_weights(noise, weights))
     return ScoreUpdate(
         state=after,
         weight=jnp.where(arrived, reported_weights, jnp.nan),
@@ -169,8 +168,8 @@ def expected_squared_residuals(
 ) -> jax.Array:
     """Return E[(e_i - t_i)^2 | e] = (e_i - t_i+)^2 + V_ii+ after a joint update with this noise, (m,).
 
-    e: innovations (m,), t: what they have of the state; t+ and V+ are its mean and covariance given e. `present`: which
-    arrived.
+    e: innovations (m,), of which `present` arrived; t: the part of e that is the state's, e = t + noise; t+ and V+:
+    mean and covariance of t given e.
     """
     t = from_columns(jnp.zeros_like(e), before.columns)
     after, _ = condition_on_observation(t, t.root, e, noise, present)
@@ -182,20 +181,18 @@ def expected_branch_precision(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the expected precision sum q_j r / r_j of each component's noise, and the noise's mean by it; (m,) each.
 
-    q_j is the probability of branch j given the component alone, r_j its variance (`least`), r the unit (`scale`); the
-    mean is sum q_j m_j / r_j over sum q_j / r_j.
-
-    Branches are the Gaussians whose mixture is the noise's law, `log_share` the logs of their shares. `before`:
-    prediction without noise.
+    The noise's law is a mixture of Gaussians j (branches) of log shares, means m_j and variances r_j; q_j is the
+    probability of j given the component alone, r a unit (`scale`). The mean is sum q_j m_j / r_j over sum q_j / r_j.
+    `before`: prediction without noise.
     """
-    log_share, mean, variance, least = law
-    total = jnp.maximum(before.columns.diagonal[:, None] + variance, least)
+    log_share, mean, variance, branch_variance = law
+    total = jnp.maximum(before.columns.diagonal[:, None] + variance, branch_variance)
     difference = e[:, None] - mean
-    logs = log_share - (difference**2 / total + jnp.log(total)) / 2
-    q = jnp.exp(logs - jnp.max(logs, axis=1, keepdims=True))  # relative to the largest
-    precision = q * scale[:, None] / least
+    log_weight = log_share - (difference**2 / total + jnp.log(total)) / 2
+    weight = jnp.exp(log_weight - jnp.max(log_weight, axis=1, keepdims=True))  # relative to the largest
+    precision = weight * scale[:, None] / branch_variance
     sum_of_precisions = jnp.sum(precision, axis=1)
-    return sum_of_precisions / jnp.sum(q, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions
+    return sum_of_precisions / jnp.sum(weight, axis=1), jnp.sum(precision * mean, axis=1) / sum_of_precisions
 
 
 def _stack_entries(entries: list[jax.Array]) -> jax.Array:

@@ -44,11 +44,13 @@ class SequentialFilter(AbstractSizedFilter):
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of the plant, and those of all nodes' measurements, one after another."""
-        # First row of each node among all that is received, and then their number.
-        starts = np.cumsum([0, *(filter.received for filter in self.filters)])
-        parts = [filter.angles_used() for filter in self.filters]
-        received = [int(start) + i for start, part in zip(starts, parts, strict=False) for i in part.received]
-        return FilterAngles(parts[0].states, tuple(received))
+        # Index of each node's first number among all that are received.
+        first_rows = np.cumsum([0, *(filter.received for filter in self.filters)]).tolist()[:-1]
+        angles_by_node = [filter.angles_used() for filter in self.filters]
+        received = [
+            first_row + i for first_row, angles in zip(first_rows, angles_by_node, strict=True) for i in angles.received
+        ]
+        return FilterAngles(angles_by_node[0].states, tuple(received))
 
     @in_float64
     def init(self) -> Gaussian:
@@ -80,10 +82,7 @@ class SequentialFilter(AbstractSizedFilter):
         arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
         def correct(belief: Gaussian, node: tuple[PyTree, jax.Array]) -> tuple[Gaussian, Innovation]:
-            """Correct with one node's measurement.
-
-            `arrays_of_node`: the numbers of its filter; `rest`: what all filters share.
-            """
+            """Correct with one node's measurement, by its filter's arrays and `rest`, which all filters share."""
             arrays_of_node, measurement = node
             filter_of_node: GaussianFilter = eqx.combine(arrays_of_node, rest)
             return filter_of_node.correct(belief, measurement, k)

@@ -102,17 +102,13 @@ def find_signal_moments(
 def bound_signal_power_at_start(sensor: LinearSensor, start: jax.Array) -> jax.Array:
     """Return (|H| root E[x_i^2] + |E v|)^2 + Var v of the p outputs y = H x + v at the start: it bounds E[y_i^2].
 
-    The noise counts without its outliers: Student's law of at most two degrees has no variance.
-
-    `start`: E[x_i^2] before any data, (n,). Not of the prior: covariances of a linear filter depend on no data, and
-    moments before data grow without end where only inputs hold a plant.
-
-    `reach`: bound of |y_i| by roots of second moments, of each output.
+    `start`: E[x_i^2] before any data, (n,), since moments before data at later steps may grow without end. The noise
+    counts without its outliers: Student's law of at most two degrees has no variance.
     """
     law = sensor.noise
-    reach = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))
-    size: jax.Array = reach**2 + diagonal(law.without_outliers().covariance)
-    return size
+    bound = lax.abs(jnp.asarray(sensor.matrix)) @ square_root(start) + lax.abs(jnp.asarray(law.mean))  # of |E y_i|
+    power: jax.Array = bound**2 + diagonal(law.without_outliers().covariance)
+    return power
 
 
 def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns:
@@ -126,13 +122,15 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 
 def noise_behind_gain(signal: Signal, gain: jax.Array, gain_spread: Array, link: WeightedColumns) -> WeightedColumns:
-    """Return `make_received_noise` of a channel with this mean gain M, spread of the gain and noise n.
+    """Return the columns of Cov(M (noise of y) + (G - M) y + n), of z = G y + n with the mean gain M.
 
-    These are the columns of Cov(M (noise of y) + (G - M) y + n). `signal.size`: bound of E[y_i^2], for rounding.
+    `gain_spread`: Cov G; `link`: columns of Cov n; `signal.size` bounds E[y_i^2], for rounding.
     """
     rounding = rounding_of((lax.abs(gain) @ square_root(signal.size)) ** 2)
-    plain = keep_for_derivatives(triangularise_noise(join_columns(signal.noise.through(gain), link, rounding)))
-    return join_columns(plain, factor_gain_noise(gain_spread, signal.second, signal.mean))
+    without_gain_noise = keep_for_derivatives(
+        triangularise_noise(join_columns(signal.noise.through(gain), link, rounding))
+    )
+    return join_columns(without_gain_noise, factor_gain_noise(gain_spread, signal.second, signal.mean))
 
 
 def factor_gain_noise(gain_spread: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
@@ -167,9 +165,10 @@ def condition_on_measurement(
     z = wrap_near(z, expected, angles)
     value = z - expected
     after, innovations = condition_on_observation(x, slopes, value, noise, present)
-    total = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
-    density = innovations.log_density(present, lax.abs(z) + lax.abs(expected))
-    return after, Innovation(value, jnp.where(present[:, None] & present, total, jnp.nan), density)
+    covariance = join_columns(WeightedColumns(slopes, x.variances), noise).covariance
+    log_likelihood = innovations.log_density(present, lax.abs(z) + lax.abs(expected))
+    covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
+    return after, Innovation(value, covariance, log_likelihood)
 
 
 def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
@@ -178,13 +177,12 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     z = G y + n of a channel with M = E G and b = E n; y is the sensor's signal.
     """
     slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
-    return join_columns(
-        WeightedColumns(slopes, signal.prior.variances), make_received_noise(signal, channel)
-    ).covariance
+    of_state = WeightedColumns(slopes, signal.prior.variances)
+    return join_columns(of_state, make_received_noise(signal, channel)).covariance
 
 
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
-    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` in the last corner."""
+    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y]; its last entry is `last`: 1, or 0 to leave the constant out."""
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
     return jnp.concatenate([top, bottom[None]])

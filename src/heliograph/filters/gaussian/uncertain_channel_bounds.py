@@ -130,15 +130,16 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
 def _find_received_slopes_and_covariances(
     signal: Signal, channel: SecondOrder, present: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return M H (m, n), and M H P H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.
+    """Return M H (m, n), and M H D H' M' and M R M' (m, m): slopes and two parts of the covariance of M y.
 
-    M: the channel's mean gain, with rows of zeros for what did not arrive.
-
-    The signal is y = H x + v, P = Cov x, R = Cov v, n states and m received numbers.
+    The signal is y = H xi + v, xi uncorrelated of variances D (`prior.variances`), Cov v = R; n states, m received
+    numbers. M: the channel's mean gain, with rows of zeros for what did not arrive.
     """
     gain = jnp.where(present[:, None], jnp.asarray(channel.mean_gain), 0.0)
     slopes = gain @ signal.slopes
-    return slopes, WeightedColumns(slopes, signal.prior.variances).covariance, signal.noise.through(gain).covariance
+    of_state = WeightedColumns(slopes, signal.prior.variances).covariance
+    of_noise = signal.noise.through(gain).covariance
+    return slopes, of_state, of_noise
 
 
 def unit_variance_where_absent(present: jax.Array) -> jax.Array:
@@ -149,10 +150,10 @@ def unit_variance_where_absent(present: jax.Array) -> jax.Array:
 def mask_received(channel: SecondOrder, present: jax.Array) -> jax.Array:
     """Return the mask (p,) of the signal's components that act on what arrived; the others count as never measured.
 
-    `channel.power`: the map E[y y'] -> received power, a center and a radius; entry [i, i, a, a] is what y_a gives to
+    `channel.power` maps E[y y'] to the received power, center and radius: its entry [i, i, a, a] is what y_a adds to
     z_i.
     """
     m, p = channel.mean_gain.shape[:2]
-    reached = (channel.power.center != 0) | (channel.power.radius != 0)
-    parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
-    return jnp.stack([jnp.any(jnp.stack(rows), axis=0) for rows in parts])
+    contributes = (channel.power.center != 0) | (channel.power.radius != 0)
+    arrived_contributions = [[contributes[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
+    return jnp.stack([jnp.any(jnp.stack(of_component), axis=0) for of_component in arrived_contributions])

@@ -94,7 +94,8 @@ class AbstractUpdate(Module):
         prior = signal.prior
         # `bound`: covariance of the error that this gain leaves, at most.
         gain, bound = self.correct(prior.covariance, signal, channel, z.present)
-        after = from_covariance(prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0), bound)
+        mean = prior.mean + gain @ jnp.where(z.present, z.innovation, 0.0)
+        after = from_covariance(mean, bound)
         return keep_where_unchanged(jnp.any(z.present), after, prior)
 
     def claim(self, uncertain: bool) -> Claim:
@@ -126,6 +127,7 @@ class Polytope(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
+        """Hold Young's scalars (beta_1, beta_2); None minimises the bound's trace over them at each step."""
         self.scalars = scalars_as_array(scalars)
 
     def condition(self, signal: Signal, channel: SecondOrder, z: ArrivedInnovation, nominal: Gaussian) -> Gaussian:
@@ -187,6 +189,7 @@ class Interval(AbstractUpdate):
     scalars: np.ndarray
 
     def __init__(self, scalars: Scalars | None = None):
+        """Hold Young's scalars (beta_1, beta_2); None minimises the bound's trace over them at each step."""
         self.scalars = scalars_as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
@@ -195,10 +198,13 @@ class Interval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        # Greatest variance of a hop's gain: largest E g^2 less the square of the smallest |E g|.
-        return combine_hop_ranges(
-            channel, lambda hop: hop.largest_second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2
-        )
+
+        def find_greatest_variance(hop: HopRange) -> float:
+            """Return the greatest variance of a hop's gain: largest E g^2 less the square of the smallest |E g|."""
+            smallest_mean = max(abs(hop.mean) - hop.mean_radius, 0.0)
+            return hop.largest_second - smallest_mean**2
+
+        return combine_hop_ranges(channel, find_greatest_variance)
 
     def described(self) -> AbstractUpdate:
         """Return Young's bound, as for a polytope."""

@@ -51,7 +51,8 @@ class Unscented(AbstractTransform):
     kappa: Scalar
 
     def __init__(self, alpha: Scalar = 1.0, beta: Scalar = 2.0, kappa: Scalar = 0.0):
-        self.alpha, self.beta = scalar("alpha", alpha, TINY), scalar("beta", beta)
+        """Hold the scaling parameters alpha, beta and kappa of the unscented transform."""
+        self.alpha, self.beta = scalar("alpha", alpha, low=TINY), scalar("beta", beta)
         self.kappa = scalar("kappa", kappa)
 
     def check(self, n: int) -> None:
@@ -64,10 +65,12 @@ class Unscented(AbstractTransform):
         alpha, beta, kappa = float(self.alpha), float(self.beta), float(self.kappa)
         if n + kappa <= 0:
             raise fail("kappa", f"more than {-n} for {n} states", kappa)
-        size = alpha**2 * abs(kappa) + abs(beta) * n
-        if alpha**2 * kappa + beta * n < -ROUNDING * size:
-            least = 0.0 - beta * n / alpha**2
-            raise fail("kappa", f"at least {least:g} for {n} states, so that no covariance is indefinite", kappa)
+        sum_of_terms = alpha**2 * abs(kappa) + abs(beta) * n
+        if alpha**2 * kappa + beta * n < -ROUNDING * sum_of_terms:
+            smallest_kappa = 0.0 - beta * n / alpha**2
+            raise fail(
+                "kappa", f"at least {smallest_kappa:g} for {n} states, so that no covariance is indefinite", kappa
+            )
 
     def image(self, function: Function, x: Gaussian) -> Image:
         """Return the moments of f(x) from its values at the mean and the 2 n points.

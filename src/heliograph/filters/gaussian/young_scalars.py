@@ -52,8 +52,8 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         """Return whether a free scalar still moves, and sweeps are left.
 
-        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched; SWEEPS:
-        most sweeps; CONVERGED, LOOP: what change is none, absolute and in units of rounding.
+        `carry`: logarithms t of the scalars, those before, and sweeps done. `free`: which scalars are searched;
+        SWEEPS: the most sweeps. A change up to CONVERGED, or up to the rounding of t in a loop, counts as none.
         """
         t, previous, sweeps = carry
         smallest_move = rounding(CONVERGED, t, LOOP)
@@ -76,18 +76,17 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     return jnp.where(free, jnp.exp(move(t, refined, jax.lax.stop_gradient(slopes))), given)
 
 
-def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-    """Return t + (I - J)^-1 (f(t) - t) for one or two components; where that step is too long, f(t).
+def newton_step(t: jax.Array, f_of_t: jax.Array, slopes: Slopes) -> jax.Array:
+    """Return t + (I - J)^-1 (f(t) - t), Newton's step for f(t) = t in one or two components; f(t) where it is too long.
 
-    `refined`: f(t); `slopes`: J.
-
-    It is a step of Newton's method for f(t) = t. LONGEST: the longest step that is trusted, 5.
+    `slopes`: J, the derivatives of f. LONGEST: the longest step that is trusted, 5.
     """
-    residual = refined - t
+    residual = f_of_t - t
     if len(residual) == 1:
         step = residual / (1 - slopes[0][0])
-    else:  # I - J = [a b; c d]
-        (a, b), (c, d) = (1 - slopes[0][0], -slopes[0][1]), (-slopes[1][0], 1 - slopes[1][1])
+    else:  # I - J = [a b; c d], inverted by its adjugate [d -b; -c a]
+        a, b = 1 - slopes[0][0], -slopes[0][1]
+        c, d = -slopes[1][0], 1 - slopes[1][1]
         step = jnp.stack([d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]]) / (a * d - b * c)
     is_safe = jnp.all(jnp.abs(step) < LONGEST)
     return t + jnp.where(is_safe, step, residual)
@@ -150,11 +149,12 @@ def zero_mean_fixed_point_map(
         The next log beta, and its derivatives by t.
     """
     beta = jnp.exp(t[0])
-    weight, (s,) = _trace_weight(base + shift / beta, cross_square, (shift,))
+    weight, (inverse_times_shift,) = _trace_weight(base + shift / beta, cross_square, (shift,))
     # d Omega / dt = -S / beta, so that d tr(W S) / dt = (2 / beta) tr(Omega^-1 S W S).
-    ws = weight @ shift
-    refined, slopes = _half_log_ratio(jnp.trace(ws), [2 / beta * jnp.vdot(s.T, ws)], trace_explained, [None])
-    return refined[None], [slopes]
+    weighted_shift = weight @ shift
+    trace, trace_slope = jnp.trace(weighted_shift), 2 / beta * jnp.vdot(inverse_times_shift.T, weighted_shift)
+    next_t, slopes = _half_log_ratio(trace, [trace_slope], trace_explained, [None])
+    return next_t[None], [slopes]
 
 
 def _trace_weight(
@@ -165,8 +165,9 @@ def _trace_weight(
     Omega: a covariance of what is received; the others X are solved with it in the same call.
     """
     solve = solver(omega)
-    first, *rest = jnp.split(solve(jnp.concatenate([cross_square, *others], axis=1)), 1 + len(others), axis=1)
-    return solve(first.T), rest
+    solved = solve(jnp.concatenate([cross_square, *others], axis=1))
+    inverse_times_square, *inverse_times_others = jnp.split(solved, 1 + len(others), axis=1)
+    return solve(inverse_times_square.T), inverse_times_others
 
 
 def _half_log_ratio(
@@ -183,9 +184,9 @@ def _half_log_ratio(
     is_positive = (top > 0) & (bottom > 0)
     top, bottom = jnp.where(is_positive, top, 1.0), jnp.where(is_positive, bottom, 1.0)
     value = jnp.log(top / bottom) / 2
-    free = is_positive & (value > np.log(SMALLEST_SCALAR))
+    is_above_limit = is_positive & (value > np.log(SMALLEST_SCALAR))
     slopes = []
     for d_top, d_bottom in zip(by_top, by_bottom, strict=True):
         slope = d_top / top if d_bottom is None else d_top / top - d_bottom / bottom
-        slopes.append(jnp.where(free, slope / 2, 0.0))
-    return jnp.where(free, value, np.log(SMALLEST_SCALAR)), slopes
+        slopes.append(jnp.where(is_above_limit, slope / 2, 0.0))
+    return jnp.where(is_above_limit, value, np.log(SMALLEST_SCALAR)), slopes

@@ -81,7 +81,12 @@ def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool
         x: the free numbers (p,).
         known_gain: whether the gain is known, so that no moment before data matters.
     """
-    slopes = tuple(jax.jvp(lambda x: _find_initial_moments(make(x)), (x,), (axis,))[1] for axis in np.eye(len(x)))
+
+    def find_moments(x: Array) -> MomentSlopes:
+        """Return the initial moments of the filter with the free numbers x."""
+        return _find_initial_moments(make(x))
+
+    slopes = tuple(jax.jvp(find_moments, (x,), (axis,))[1] for axis in np.eye(len(x)))
     start = jax.tree.map(jnp.asarray, make(x).init())
     if known_gain:
         return EstimateWithDerivatives(start.gaussian, slopes)
@@ -157,7 +162,7 @@ def find_model_matrices(
 
 def _find_initial_moments(filter: Any) -> MomentSlopes:
     """Return the mean and covariance before the first step."""
-    plant = at(filter.plant, 0)
+    plant = at(filter.plant, k=0)
     return MomentSlopes(jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance))
 
 

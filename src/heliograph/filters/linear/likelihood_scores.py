@@ -48,18 +48,21 @@ class ScoreRecursion(Recursion):
     ) -> tuple[EstimateWithDerivatives, PyTree]:
         """Return the estimate and its derivatives after row k, and what is kept of the row.
 
-        Kept are log-density, its derivatives, and unless not `informed` the information (2, p, p) in rows up to `half`
-        and from it on. e: innovation, s: its covariance.
+        Kept are the innovation's log-density, its derivatives by the p free numbers, and where `informed` the
+        information (2, p, p): of rows before `half`, and from it on, zero for the half to which the row does not
+        belong.
         """
-        after, (e, s, *slopes, present, lost) = differentiate_step(self.make, self.x, state, row, k)
-        size = jnp.abs(row[0]) + jnp.abs(row[0] - e)
-        kept = differentiate_log_density(e, s, (slopes[0], slopes[1]), size, present)
+        after, (innovation, covariance, *slopes, present, is_invalid) = differentiate_step(
+            self.make, self.x, state, row, k
+        )
+        size = jnp.abs(row[0]) + jnp.abs(row[0] - innovation)
+        kept = differentiate_log_density(innovation, covariance, (slopes[0], slopes[1]), size, present)
         # Where the estimate is no number, no likelihood is taken for that of silence.
-        density, score, information = (jnp.where(lost, jnp.nan, part) for part in kept)
+        density, score, information = (jnp.where(is_invalid, jnp.nan, value) for value in kept)
         if not self.informed:
             return after, (density, score)
-        within = jnp.stack([k < self.half, k >= self.half])
-        return after, (density, score, jnp.where(within[:, None, None], information, 0.0))
+        in_half = jnp.stack([k < self.half, k >= self.half])
+        return after, (density, score, jnp.where(in_half[:, None, None], information, 0.0))
 
     def scan(self, z: Array, u: Array) -> Scores:
         """Return log-densities (rows,) and scores (rows, p) row by row, and the information; it may be traced.
@@ -71,12 +74,13 @@ class ScoreRecursion(Recursion):
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
             """Step over one row: add its information, and put out its log-density and score.
 
-            `now`: the estimate with its derivatives, and the information summed so far; `halves`: that of this row, in
-            the half of the recording to which it belongs.
+            `now`: the estimate with its derivatives, and the information summed so far, of both halves of the
+            recording.
             """
+            estimate, information = now
             k, z, u = row
-            after, (density, score, halves) = self.step(now[0], (z, u), k)
-            return (after, now[1] + halves), (density, score)
+            after, (density, score, information_of_row) = self.step(estimate, (z, u), k)
+            return (after, information + information_of_row), (density, score)
 
         start: Now = (differentiate_start(self.make, self.x, self.known_gain), jnp.zeros((2, len(self.x), len(self.x))))
         (_, halves), (density, score) = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))
@@ -89,8 +93,10 @@ class ScoreRecursion(Recursion):
         """
         if not is_long(len(z)):
             return None
-        whole = sum_in_chunks(self, self._start(), (z, u))
-        summed: Scores | None = None if whole is None else jax.tree.map(lambda leaf: leaf.sum(axis=0), whole.outputs)
+        by_chunk = sum_in_chunks(self, self._start(), (z, u))
+        if by_chunk is None:
+            return None
+        summed: Scores = jax.tree.map(lambda sums: sums.sum(axis=0), by_chunk.outputs)
         return summed
 
     def scan_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
@@ -100,7 +106,8 @@ class ScoreRecursion(Recursion):
             return None
         # Rows are passed again, for log-densities and scores row by row: information is a sum already.
         rows = scan_in_chunks(replace(self, informed=False), self._start(), (z, u))
-        return None if rows is None else (*rows.outputs, sums[2])
+        *_, information = sums
+        return None if rows is None else (*rows.outputs, information)
 
     def _start(self) -> EstimateWithDerivatives:
         """Return the estimate before the first row with its derivatives, computed in double precision by XLA."""

@@ -80,14 +80,13 @@ class LinearFilter(AbstractSizedFilter):
     @in_float64
     def init(self) -> LinearBelief:
         """Return the prior, both as estimate and as the state's moments before data."""
-        return prior_belief(at(self.plant, 0))
+        return prior_belief(at(self.plant, k=0))
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Predict both pairs of moments, of the estimate and of the state without data: A m + B u + E w, A P A' + Q."""
-        return predict_belief(
-            state, motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
-        )
+        motion = motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
+        return predict_belief(state, motion)
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
@@ -101,16 +100,15 @@ class LinearFilter(AbstractSizedFilter):
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of x+ = A x + b + w; w is white and independent of gains and past draws.
+        """Return the smoother step of x+ = A x + b + w by the Rauch-Tung-Striebel recursion.
 
-        So the Rauch-Tung-Striebel recursion is the best linear one.
-
-        `moved`: slopes of A x in the factors of x, and factors of w.
+        It is the best linear one: w is white and independent of gains and past draws. `slopes_and_noise`: slopes of A
+        x in the factors of x, and factors of w.
         """
-        move = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
-        moved = move.matrix @ step.before.gaussian.root, move.noise
+        motion = motion_of_plant(at(self.plant, step.k), jnp.asarray(step.u), second_moments_at_start(self.plant))
+        slopes_and_noise = motion.matrix @ step.before.gaussian.root, motion.noise
         claim: Claim = self.claim if self.mean_known else "nominal"
-        return smoother_step_of(step, moved, claim)
+        return smoother_step_of(step, slopes_and_noise, claim)
 
     @property
     def is_linear(self) -> bool:
@@ -156,10 +154,8 @@ class LinearFilter(AbstractSizedFilter):
 def signal_before_data(state: LinearBelief, sensor: LinearSensor, start: jax.Array) -> Signal:
     """Return the moments of y = C x + v before any data, E y and E[y y'], with the slopes of the estimate's error.
 
-    They depend on the error covariance and the state's moments before data alone, not on the estimate, so that
-    derivatives by the estimate do not involve them.
-
-    `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
+    They depend on the error covariance and the state's moments before data alone, not on the estimate: derivatives by
+    the estimate do not involve them. `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
     """
     y = MomentsBeforeData(state.state_mean, state.state_covariance).measure(sensor)
     return Signal(
@@ -182,8 +178,9 @@ def correct_linear(
     `rule`: how uncertain probabilities of the channel are bounded; `start`: E[x_i^2] at the start, for rounding.
     """
     before_data = signal_before_data(state, sensor, start)
-    by_estimate = before_data._replace(mean=jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean))
-    after, innovation = correct_signal(by_estimate, channel, rule, z, unknown=before_data)
+    expected_y = jnp.asarray(sensor.matrix @ state.gaussian.mean + sensor.noise.mean)
+    given_estimate = before_data._replace(mean=expected_y)
+    after, innovation = correct_signal(given_estimate, channel, rule, z, unknown=before_data)
     return state._replace(gaussian=after), innovation
 
 
@@ -354,9 +351,10 @@ def as_current_filter(
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
     check_linear("filter that takes delayed signals as current", plant, sensor)
-    ignoring = linear_filter(plant, sensor, without_memory(wrappers.deliver_line_as_current(channel)), update)
-    assert isinstance(ignoring, LinearFilter)  # a channel without delay or memory has no other
-    return _claim_nominal(ignoring) if first(channel).past or memory_matters(channel) else ignoring
+    without_delay = without_memory(wrappers.deliver_line_as_current(channel))
+    filter = linear_filter(plant, sensor, without_delay, update)
+    assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
+    return _claim_nominal(filter) if first(channel).past or memory_matters(channel) else filter
 
 
 def _claim_nominal(ignoring: LinearFilter) -> LinearFilter:

@@ -66,14 +66,16 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
     """Return the prior, both as estimate and as the state's moments before data."""
     xp = library(start.initial_mean, start.initial_covariance)
     mean, covariance = xp.asarray(start.initial_mean), xp.asarray(start.initial_covariance)
-    return LinearBelief(from_covariance(start.initial_mean, start.initial_covariance), mean, covariance)
+    estimate = from_covariance(start.initial_mean, start.initial_covariance)
+    return LinearBelief(estimate, mean, covariance)
 
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
     """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
     gaussian = predict_affine(belief.gaussian, step.matrix, step.shift, step.noise)
     before_data = MomentsBeforeData(belief.state_mean, belief.state_covariance)
-    return LinearBelief(gaussian, *before_data.predict(step.matrix, step.shift, step.covariance))
+    mean, covariance = before_data.predict(step.matrix, step.shift, step.covariance)
+    return LinearBelief(gaussian, mean, covariance)
 
 
 class MomentsBeforeData(NamedTuple):
@@ -88,23 +90,23 @@ class MomentsBeforeData(NamedTuple):
         return MomentsBeforeData(*_limit_to_finite_squares(matrix @ self.mean + shift, symmetric(covariance)))
 
     def measure(self, sensor: LinearSensor) -> SignalMoments:
-        """Return the moments of the signal y = C x + v.
+        """Return the moments of the signal y = C x + v: its mean, E[y y'] and the columns of Cov v.
 
-        They are its mean, E[y y'] and the columns of its noise, whose law may depend on the signal.
+        The law of v may depend on the signal's mean and variances; `state_part`: C Cov(x) C'.
         """
         matrix, law = jnp.asarray(sensor.matrix), sensor.noise
-        mean, explained = matrix @ self.mean + law.mean, matrix @ self.covariance @ matrix.T
-        noise = law.given_signal(mean, diagonal(explained))
-        second = symmetric(explained + noise.covariance + outer(mean, mean))
+        mean = matrix @ self.mean + law.mean
+        state_part = matrix @ self.covariance @ matrix.T
+        noise = law.given_signal(mean, diagonal(state_part))
+        second = symmetric(state_part + noise.covariance + outer(mean, mean))
         return SignalMoments(mean=mean, second=second, noise=noise.columns)
 
 
 def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return moments without data, limited to numbers whose squares are finite: an unstable plant's grow for ever.
 
-    Behind a known gain nothing depends on them.
-
-    `largest`: the root of the largest number, a limit of second moments; a mean is limited by its root.
+    Second moments are limited by `largest`, the root of the largest number, means by its root. Behind a known gain
+    nothing depends on them.
     """
     largest = float(np.finfo(covariance.dtype).max) ** 0.5
     return _clip_to(mean, largest**0.5), _clip_to(covariance, largest)

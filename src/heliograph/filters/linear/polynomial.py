@@ -66,6 +66,7 @@ class PolynomialFilter(AbstractSizedFilter):
     def __init__(
         self, inner: AbstractFilter, degree: int, endless: bool = False, centre: UnconditionalMean | None = None
     ):
+        """Wrap `inner`, a filter of z's monomials up to `degree`; see the class for `endless` and `centre`."""
         instance("inner filter", inner, AbstractFilter, "a filter")
         check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
@@ -98,8 +99,8 @@ class PolynomialFilter(AbstractSizedFilter):
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
         """Correct the inner filter with all monomials of z up to `degree`, less the mean where one is subtracted."""
         z = _subtract_mean(self.centre, z, state.mean, k)
-        # [:-1]: without the constant
-        after, innovation = self.inner.correct(state.inner, evaluate_monomials(z, self.degree)[:-1], k)
+        monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
+        after, innovation = self.inner.correct(state.inner, monomials, k)
         return CentredState(after, state.mean), _select_degree_one(innovation, z, self.degree)
 
     @estimates
@@ -116,8 +117,9 @@ class PolynomialFilter(AbstractSizedFilter):
 
         The state is of all monomials, with the estimate in a part; `shift` adds the mean that was subtracted.
         """
-        z = evaluate_monomials(_subtract_mean(self.centre, step.z, step.prior.mean, step.k), self.degree)[:-1]
-        inner = step.map_states(lambda state: state.inner)._replace(z=z)
+        z = _subtract_mean(self.centre, step.z, step.prior.mean, step.k)
+        monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
+        inner = step.map_states(lambda state: state.inner)._replace(z=monomials)
         return replace(self.inner.smoother_step(inner), shift=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -143,9 +145,9 @@ def _predict_mean(centre: UnconditionalMean | None, mean: Array, k: Step) -> Arr
     """
     if centre is None:
         return mean
-    c = at(centre, k)
-    moved: jax.Array = c.transition @ mean + c.drift
-    return moved
+    step = at(centre, k)
+    predicted: jax.Array = step.transition @ mean + step.drift
+    return predicted
 
 
 def _subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k: Step) -> jax.Array:
@@ -164,9 +166,10 @@ def _select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: in
     `degree`: of all monomials of (z, 1).
     """
     # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
-    m, places = len(z), position(len(z) + 1, degree)
-    of_z = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
-    value, covariance = innovation.value[of_z], innovation.covariance[of_z][:, of_z]
+    m, position_of = len(z), position(len(z) + 1, degree)
+    exponents = [(*row, degree - 1) for row in np.eye(m, dtype=int).tolist()]
+    indices = np.array([position_of[powers] for powers in exponents])
+    value, covariance = innovation.value[indices], innovation.covariance[indices][:, indices]
     return Innovation(value, covariance, log_density(value, covariance, jnp.abs(z)))
 
 
@@ -200,7 +203,7 @@ def polynomial_filter(
     centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, polynomial_claim(plant, sensor, channel, degree)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
-    filter = PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
+    filter = PolynomialFilter(inner, degree, endless=_is_steady(plant, sensor, channel, system), centre=centre)
     return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
@@ -224,7 +227,7 @@ def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: Lin
     """
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
-    return all(np.allclose(step[-1], step[-2], rtol=1e-12, atol=0) for step in system.steps)
+    return all(np.allclose(matrices[-1], matrices[-2], rtol=1e-12, atol=0) for matrices in system.steps)
 
 
 def scheduled_polynomial_filter(
@@ -247,10 +250,9 @@ def scheduled_polynomial_filter(
     Source: as `polynomial_filter`.
     """
     centre, system = _lift_about_mean(plant, sensor, channel, degree, horizon)
-    inner = ScheduledFilter(lmmse(system, polynomial_claim(plant, sensor, channel, degree)), first(plant).states)
-    return with_premise(
-        PolynomialFilter(inner, degree, centre=centre), Premise(plant, sensor, channel, order=2 * degree)
-    )
+    schedule = lmmse(system, polynomial_claim(plant, sensor, channel, degree))
+    filter = PolynomialFilter(ScheduledFilter(schedule, first(plant).states), degree, centre=centre)
+    return with_premise(filter, Premise(plant, sensor, channel, order=2 * degree))
 
 
 class MemoryState(NamedTuple):
@@ -299,9 +301,10 @@ class MemoryFilter(AbstractSizedFilter):
         """
         z = _subtract_mean(self.centre, z, state.mean, k)
         linear, _ = self.linear.correct(state.linear, z, k)
-        lifted = jnp.concatenate([evaluate_monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
+        monomials = evaluate_monomials(z, degree=2)[:-1]  # z and its squares, without the constant
+        lifted = jnp.concatenate([monomials, jnp.outer(z, linear.mean).reshape(-1)])
         products, innovation = self.products.correct(state.products, lifted, k)
-        return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, 2)
+        return MemoryState(linear, products, state.mean), _select_degree_one(innovation, z, degree=2)
 
     @estimates
     def estimate(self, state: MemoryState) -> Estimate:
@@ -330,8 +333,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
     check_forgets("channel of a memory filter", check_maps("channel", [first(channel)])[0])
-    claim = polynomial_claim(plant, sensor, channel, 2)
-    centre, system = _lift_about_mean(plant, sensor, channel, 1, horizon)
+    claim = polynomial_claim(plant, sensor, channel, degree=2)
+    centre, system = _lift_about_mean(plant, sensor, channel, degree=1, horizon=horizon)
     linear = lmmse(system, claim)  # its gains give the moments of its products with z
     centred_plant = plant if centre is None else centre_plant(plant)
     products = lmmse(quadratic_system_with_linear_estimate(centred_plant, sensor, channel, linear), linear.claim)
@@ -351,6 +354,6 @@ def polynomial_claim(plant: AnyPlant, sensor: AnySensor, channel: Channel, degre
     if first(channel).remembers:
         claim: Claim = "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     else:
-        # one corner: all probabilities are known
-        claim = "exact" if all(c.corner_count() == 1 for c in unstack(channel)) else "nominal"
+        # The extreme laws of uncertain probabilities: only one if all are known.
+        claim = "exact" if all(step.corner_count() == 1 for step in unstack(channel)) else "nominal"
     return lower_claim_by_noise(claim, plant, sensor, channel)

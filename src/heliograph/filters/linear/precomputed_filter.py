@@ -101,7 +101,8 @@ class PlannedFilter(AbstractSizedFilter):
         step: LinearStep = at(self.steps, k)
         z, expected = jnp.asarray(z), step.expect(state.mean)
         mean = step.correct(state.mean, z - expected)
-        return PlannedMean(mean, _convert_stage(state, 2 * k + 2)), gaussian_innovation(z, expected, step.innovation)
+        after = PlannedMean(mean, _convert_stage(state, 2 * k + 2))
+        return after, gaussian_innovation(z, expected, step.innovation)
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
@@ -120,7 +121,8 @@ class PlannedFilter(AbstractSizedFilter):
         if self.past is None:
             return super().smoother_step(step)
         planned = cast(SmootherStep, at(self.past, step.k))
-        return planned.with_data(*(jnp.asarray(state.mean) for state in (step.before, step.prior, step.after)))
+        before, prior, after = (jnp.asarray(state.mean) for state in (step.before, step.prior, step.after))
+        return planned.with_data(before, prior, after)
 
     def with_past(self, steps: SmootherStep) -> AbstractFilter:
         """Return the filter with smoother steps, which are the same for all data."""
@@ -150,7 +152,7 @@ def plan_filter(
     arguments = filter, array("inputs", inputs, (None, len(filter.inputs))), projection
     if is_traced(arguments):
         return _record_matrices(*arguments)
-    return cast(PlannedFilter, compute_once(_record_matrices, _plan_by_xla, arguments, SHORT))
+    return cast(PlannedFilter, compute_once(_record_matrices, _plan_by_xla, arguments, most=SHORT))
 
 
 def _record_matrices(filter: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
@@ -253,8 +255,8 @@ def linear_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Arra
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
     if isinstance(filter, PlannedFilter):
-        outcome: LinearStep = at(filter.steps, k)  # recorded already
-        return outcome
+        recorded: LinearStep = at(filter.steps, k)
+        return recorded
     step, _, _ = record_step_matrices(filter, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
     return step._replace(

@@ -67,15 +67,15 @@ class ScheduledFilter(AbstractSizedFilter):
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
         """Keep the gains of each step, the covariances after each, and which received numbers no gain uses."""
         instance("schedule", schedule, Schedule, "a Schedule")
-        g = schedule.gains
-        self.gains = OverTime(_gains_for_expected_measurement(g))
-        self.unused = np.all(g.gain == 0, axis=1) & np.all(g.direct == 0, axis=1)
+        gains = schedule.gains
+        self.gains = OverTime(_gains_for_expected_measurement(gains))
+        self.unused = np.all(gains.gain == 0, axis=1) & np.all(gains.direct == 0, axis=1)
         # Before and after each correction, one after the other; NaN at the start, where none is claimed.
-        known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
-        self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
+        covariances = np.stack([gains.predicted, gains.covariance], axis=1).reshape(-1, *gains.covariance.shape[1:])
+        self.covariances = np.concatenate([np.full_like(covariances[:1], np.nan), covariances])
         self.start, self.claim = schedule.start, schedule.claim
-        self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
-        self.received, self.kept = g.direct.shape[2], schedule.kept
+        self.states, self.inputs = names("state names", states, gains.direct.shape[1], "x"), ()
+        self.received, self.kept = gains.direct.shape[2], schedule.kept
 
     @compile_on_call
     def init(self) -> ScheduleState:
@@ -100,12 +100,12 @@ class ScheduledFilter(AbstractSizedFilter):
         s: state of the recursion of the saved gains; `complete`: no number was missing; `stage`: predictions and
         corrections made.
         """
-        g: Gains = at(self.gains, k)
+        gains: Gains = at(self.gains, k)
         s = state.value
         return ScheduleState(
-            value=g.transition @ s + g.offset,
-            mean=g.output @ s + g.output_offset,
-            expected=g.expected @ s + g.expected_offset,
+            value=gains.transition @ s + gains.offset,
+            mean=gains.output @ s + gains.output_offset,
+            expected=gains.expected @ s + gains.expected_offset,
             complete=state.complete,
             stage=jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
         )
@@ -117,18 +117,19 @@ class ScheduledFilter(AbstractSizedFilter):
         `unused`: numbers that no gain uses, which may be missing. Once another was, the saved covariances hold no more:
         NaN.
         """
-        g: Gains = at(self.gains, k)
+        gains: Gains = at(self.gains, k)
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
         innovation = jnp.where(present, z - state.expected, 0.0)
         after = ScheduleState(
-            value=state.value + g.gain @ innovation,
-            mean=state.mean + g.direct @ innovation,
+            value=state.value + gains.gain @ innovation,
+            mean=state.mean + gains.direct @ innovation,
             expected=state.expected,
             complete=state.complete & jnp.all(present | jnp.asarray(self.unused)[k]),
             stage=jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
         )
-        return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
+        covariance = jnp.where(state.complete, gains.innovation, jnp.nan)
+        return after, gaussian_innovation(z, state.expected, covariance)
 
     @estimates
     def estimate(self, state: ScheduleState) -> Estimate:
@@ -145,17 +146,17 @@ class ScheduledFilter(AbstractSizedFilter):
         return Estimate(state.mean, claimed, self.claim)
 
 
-def _gains_for_expected_measurement(g: Gains) -> Gains:
-    """Return the gains of a step without data: e = G s + g for z in s+ = F s + K z + c and xhat = L s + J z + d.
+def _gains_for_expected_measurement(gains: Gains) -> Gains:
+    """Return the gains of a step without data, z being replaced by what is expected of it, e = G s + g.
 
-    e: expected measurement; s: state of the gains' recursion; F, K, L, J, c, d: its matrices. e in place of z leaves
-    functions of s alone.
+    The saved recursion of s is s+ = F s + K z + c, with the estimate L s + J z + d: of s alone it has F + K G, c + K
+    g, L + J G and d + J g.
     """
-    return g._replace(
-        transition=g.transition + g.gain @ g.expected,
-        offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
-        output=g.output + g.direct @ g.expected,
-        output_offset=g.output_offset + np.einsum("tim,tm->ti", g.direct, g.expected_offset),
+    return gains._replace(
+        transition=gains.transition + gains.gain @ gains.expected,
+        offset=gains.offset + np.einsum("tim,tm->ti", gains.gain, gains.expected_offset),
+        output=gains.output + gains.direct @ gains.expected,
+        output_offset=gains.output_offset + np.einsum("tim,tm->ti", gains.direct, gains.expected_offset),
     )
 
 
@@ -203,9 +204,10 @@ class LinearSystemFilter(AbstractSizedFilter):
 
         z = output x + offset + noise; `slopes` of z are in the factors of x.
         """
-        s: Steps = at(self.steps, k)
+        step: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
-        expected, slopes = s.output @ state.mean + s.offset, jnp.asarray(s.output @ state.root)
+        expected = step.output @ state.mean + step.offset
+        slopes = jnp.asarray(step.output @ state.root)
         return condition_on_measurement(state, slopes, noise, z, expected)
 
     @estimates
@@ -235,57 +237,57 @@ class SystemNoises(NamedTuple):
 def _factor_noises(system: LinearSystem) -> SystemNoises:
     """Return the factors of both noises at each step, with the rounding of numbers as large as the system makes them.
 
-    A combination of measurements that is free of noise is so to the rounding of Cov(v) itself, which is joined too:
-    else one that repeats another would measure, without noise, the state times what rounding left of their difference.
-
-    `lost`: rounding errors that the noise's variances have themselves, where they came out of a subtraction.
+    Without the noise's own rounding, a combination of measurements that repeats another would seem to measure the
+    state without noise, by what rounding left of their difference.
     """
-    s = system.steps
-    of_states, of_received = _second_moments_of_steps(system)
+    steps = system.steps
+    state_moments, received_moments = _second_moments_of_steps(system)
 
-    def factor(covariances: np.ndarray, seconds: np.ndarray, lost: np.ndarray) -> WeightedColumns:
+    def factor(covariances: np.ndarray, second_moments: np.ndarray, errors: np.ndarray) -> WeightedColumns:
         """Return the factors of noises (time, n, n), with the rounding of numbers of second moments (time, n)."""
-        rounding = seconds + np.diagonal(covariances, axis1=1, axis2=2)
-        return _factor_with_rounding(factor_covariances(covariances), rounding, lost)
+        rounding = second_moments + np.diagonal(covariances, axis1=1, axis2=2)
+        return _factor_with_rounding(factor_covariances(covariances), rounding, errors)
 
-    process = factor(np.asarray(s.process), of_states, np.zeros(of_states.shape))
-    return SystemNoises(process, factor(np.asarray(s.noise), of_received, system.received_rounding))
+    process = factor(np.asarray(steps.process), state_moments, np.zeros(state_moments.shape))
+    return SystemNoises(process, factor(np.asarray(steps.noise), received_moments, system.received_rounding))
 
 
 @compile_in_float64
-def _factor_with_rounding(noise: WeightedColumns, seconds: Array, lost: Array) -> WeightedColumns:
-    """Return the factors of each step's noise, the rounding of numbers of these second moments, and what was lost.
+def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, rounding_errors: Array) -> WeightedColumns:
+    """Return the factors of each step's noise, joined with the rounding of numbers of these second moments.
 
-    Shapes: noise (steps, n, columns), seconds and lost (steps, n), variances lost already.
-
-    `seconds`: second moments of the numbers; `lost`: rounding errors of the noise's own variances.
+    `rounding_errors`: of the noise's own variances. Shapes: noise (steps, n, columns), the others (steps, n).
     """
 
-    def factor_step(noise: WeightedColumns, seconds: jax.Array, lost: jax.Array) -> WeightedColumns:
-        """Return the factors of one step."""
-        return triangularise(join_columns(noise, rounding_of(seconds), WeightedColumns(np.eye(len(lost)), lost)))
+    def factor_step(noise: WeightedColumns, second_moments: jax.Array, rounding_errors: jax.Array) -> WeightedColumns:
+        """Return the factors of a step's noise plus two diagonal covariances: rounding of numbers and of variances."""
+        columns_of_errors = WeightedColumns(np.eye(len(rounding_errors)), rounding_errors)
+        return triangularise(join_columns(noise, rounding_of(second_moments), columns_of_errors))
 
     factor_steps: Callable[..., WeightedColumns] = jax.vmap(factor_step)
-    return factor_steps(noise, seconds, lost)
+    return factor_steps(noise, second_moments, rounding_errors)
 
 
 def _second_moments_of_steps(system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
-    """Return (|A| root E[y_i^2] + |a|)^2 of each next state (time, N), and the same of what is received (time, m).
+    """Return bounds of the second moments at each step, of the next state (time, N) and of what is received (time, m).
 
-    They are the sizes of what is summed, for its rounding. By the moments before any data, since parts of a system that
-    start at zero do not stay there; limited to numbers whose squares are finite.
-
-    A y + a is the next state y of the system, with rows of A in absolute value.
+    For x+ = A x + a they are (|A| root E[x_i^2] + |a|)^2, the squared size of what is summed, which its rounding
+    depends on. By the moments before any data, limited to numbers whose squares are finite: of parts of a system that
+    start at zero the moments grow.
     """
-    s, mean, covariance = system.steps, system.mean, system.covariance
+    steps, mean, covariance = system.steps, system.mean, system.covariance
     largest = float(np.finfo(float).max) ** 0.5  # of a second moment; of a mean its root
-    of_states, of_received = [], []
-    for k in range(len(s.transition)):
-        reach = np.sqrt(mean**2 + np.diagonal(covariance))
-        of_states.append(np.minimum(np.abs(s.transition[k]) @ reach + np.abs(s.drift[k]), largest**0.5) ** 2)
-        mean = np.clip(s.transition[k] @ mean + s.drift[k], -(largest**0.5), largest**0.5)
-        covariance = s.transition[k] @ covariance @ s.transition[k].T + s.process[k]
+    state_moments, received_moments = [], []
+    for k in range(len(steps.transition)):
+        root_power = np.sqrt(mean**2 + np.diagonal(covariance))
+        state_moments.append(
+            np.minimum(np.abs(steps.transition[k]) @ root_power + np.abs(steps.drift[k]), largest**0.5) ** 2
+        )
+        mean = np.clip(steps.transition[k] @ mean + steps.drift[k], -(largest**0.5), largest**0.5)
+        covariance = steps.transition[k] @ covariance @ steps.transition[k].T + steps.process[k]
         covariance = np.clip(covariance, -largest, largest)
-        reach = np.sqrt(mean**2 + np.diagonal(covariance))
-        of_received.append(np.minimum(np.abs(s.output[k]) @ reach + np.abs(s.offset[k]), largest**0.5) ** 2)
-    return np.stack(of_states), np.stack(of_received)
+        root_power = np.sqrt(mean**2 + np.diagonal(covariance))
+        received_moments.append(
+            np.minimum(np.abs(steps.output[k]) @ root_power + np.abs(steps.offset[k]), largest**0.5) ** 2
+        )
+    return np.stack(state_moments), np.stack(received_moments)

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.precomputed_filter import LinearStep, PlannedFilter
-from heliograph.filters.modes.jump_linear_filter import ChannelByMode, channels_by_mode
+from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mode
 from heliograph.model.augmented.past_outputs import with_past
 from heliograph.model.channel import Channel, check_link
@@ -93,7 +93,7 @@ def true_error(
     difference = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         transition = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
-        moments = _propagate_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
+        moments = _predict_joint_moments(moments, at(plant, k), at(planned.steps, k), u[k], transition)
         moments = _correct_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(difference @ moments.sum(axis=0) @ difference.T)
     # Claimed covariances lie as start, then before and after correction of each step: every second one from the third.
@@ -113,32 +113,32 @@ def _check_fits(filter: AbstractFilter, plant: AnyPlant, sensor: AnySensor, chan
         raise fail("filter", f"one of {n} states that receives {received} numbers", got)
 
 
-def _propagate_moments(
-    moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, rows: np.ndarray
+def _predict_joint_moments(
+    moments: np.ndarray, plant: LinearPlant, step: LinearStep, u: np.ndarray, transition: np.ndarray
 ) -> np.ndarray:
     """Return E[r r' 1{mode}] (M, size, size), r = (x, 1, s), after the prediction of a step.
 
-    x+ = A x + b + w of the plant, s- = F s + f of the filter, and the modes move by their chain.
-
-    s: the mean of the filter, whose state is affine in the data; 1{mode}: indicator of the channel's mode.
+    x+ = A x + b + w of the plant, s- = F s + f of the filter's mean s, and the modes move by their chain. 1{mode} is
+    1 in a mode of the channel, else 0.
 
     Args:
         moments: E[r r' 1{mode}] before the step.
         plant: the true plant.
         step: the filter's F and f.
         u: input of the step.
-        rows: transition matrix of the modes (M, M).
+        transition: transition matrix of the modes (M, M).
     """
-    n, inputs, size = len(plant.states), jnp.asarray(u), moments.shape[-1]
+    n, size = len(plant.states), moments.shape[-1]
+    inputs = jnp.asarray(u)
     # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0).
-    move, noise = np.zeros((2, size, size))
-    move[:n, :n], move[n, n] = plant.transition_matrix(inputs), 1.0
-    move[:n, n] = plant.shift(inputs)
-    move[n + 1 :, n + 1 :], move[n + 1 :, n] = step.transition, step.drift
+    matrix, noise = np.zeros((2, size, size))
+    matrix[:n, :n], matrix[n, n] = plant.transition_matrix(inputs), 1.0
+    matrix[:n, n] = plant.shift(inputs)
+    matrix[n + 1 :, n + 1 :], matrix[n + 1 :, n] = step.transition, step.drift
     noise[:n, :n] = plant.noise_covariance(inputs)
-    before = mix_moments_of_modes(rows, moments)
+    before = mix_moments_of_modes(transition, moments)
     # `before[:, n, n]`: E[1 1{mode}], the probability of each mode.
-    return np.asarray(propagate_by_mode(move, before, before[:, n, n, None, None] * noise))
+    return np.asarray(propagate_by_mode(matrix, before, before[:, n, n, None, None] * noise))
 
 
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, world: ChannelByMode, step: LinearStep) -> np.ndarray:

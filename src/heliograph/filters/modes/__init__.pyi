@@ -9,9 +9,9 @@ from .arrival_patterns import describe_by_pattern as describe_by_pattern
 from .arrival_patterns import pattern_of as pattern_of
 from .finite_support_filter import AtomCombinations as AtomCombinations
 from .finite_support_filter import MixtureFilter as MixtureFilter
-from .jump_linear_filter import ChannelByMode as ChannelByMode
+from .channel_by_mode import ChannelByMode as ChannelByMode
 from .jump_linear_filter import ModalFilter as ModalFilter
-from .jump_linear_filter import channels_by_mode as channels_by_mode
+from .channel_by_mode import channels_by_mode as channels_by_mode
 from .jump_linear_filter import claim_of_modes as claim_of_modes
 from .jump_linear_filter import modal_filter as modal_filter
 from .mode_observed import ModeObservedFilter as ModeObservedFilter
@@ -20,7 +20,7 @@ from .multiple_model import ModalBeliefs as ModalBeliefs
 from .multiple_model import MultipleModelFilter as MultipleModelFilter
 from .multiple_model import correct_in_every_mode as correct_in_every_mode
 from .multiple_model import imm_filter as imm_filter
-from .multiple_model import replicate as replicate
+from .mixing import replicate as replicate
 from .side_information import SideInformationFilter as SideInformationFilter
 from .side_information import side_information_filter as side_information_filter
 from .uncertain_chain import UncertainModalFilter as UncertainModalFilter

@@ -29,11 +29,10 @@ from heliograph.factors.covariance_factors import (
 from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_covariance
 from heliograph.filters.base import Step, corrects, make_sizes, predicts
 from heliograph.filters.gaussian.signal_moments import factor_spread
+from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.filters.modes.jump_linear_filter import (
     AbstractModalFilter,
-    ChannelByMode,
     MeasurementModel,
-    channels_by_mode,
     claim_of_modes,
     concatenate_modes,
     condition_modes_on_received,
@@ -87,7 +86,7 @@ class AdditiveModalFilter(AbstractModalFilter):
     @compile_on_call
     def init(self) -> AdditiveBelief:
         """Return the prior, independent of the modes: Cov(zeta) = Gamma x E[x~ x~'], less E[x~] E[x~]' of x~ itself."""
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         spread = pad_with_zeros(jnp.asarray(start.initial_covariance))
         laws = tuple(jnp.asarray(law) for law in self.initial)
         second = spread.at[-1, -1].set(1.0)
@@ -106,20 +105,24 @@ class AdditiveModalFilter(AbstractModalFilter):
     def predict(self, state: AdditiveBelief, u: ArrayLike = (), k: Step = 0) -> AdditiveBelief:
         """Move x~ by the plant and each mode by its chain; at the first prediction the modes have their initial law.
 
-        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode, less its probability; `second`: E[x~
-        x~'] before data.
+        x~ = (x - centre, 1); zeta: x~ times 1 and times each indicator of a mode, less its probability;
+        `second_moment`: E[x~ x~'] before data.
         """
-        move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
-        rows = self._transition_matrices(state, k)
+        matrix, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
+        transitions = self._transition_matrices(state, k)
         # F zeta about the moving centre.
-        centred = state.gaussian.mean - self._mean_from_centre(state.centre)
-        moved = predict_by_mode(centred[:, None], move, _function_transition(rows).T)[:, 0]
-        mean = moved + self._mean_from_centre(centre)
+        deviation = state.gaussian.mean - self._mean_from_centre(state.centre)
+        predicted_deviation = predict_by_mode(deviation[:, None], matrix, _function_transition(transitions).T)[:, 0]
+        mean = predicted_deviation + self._mean_from_centre(centre)
         root, noise_of_zeta = self._transition_factors(state, u, k)
         after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise_of_zeta))
-        second = move @ state.second @ move.T + noise
+        second_moment = matrix @ state.second @ matrix.T + noise
         return AdditiveBelief(
-            gaussian=after, second=second, laws=_next_laws(state.laws, rows), centre=centre, moved=jnp.asarray(True)
+            gaussian=after,
+            second=second_moment,
+            laws=_next_laws(state.laws, transitions),
+            centre=centre,
+            moved=jnp.asarray(True),
         )
 
     @corrects
@@ -133,19 +136,19 @@ class AdditiveModalFilter(AbstractModalFilter):
         functions' second moments.
         """
         output, x = self._measurement_model(state, k), state.gaussian
-        after, innovation = condition_modes_on_received(x, x.mean - self._mean_from_centre(state.centre), output, z)
+        deviation = x.mean - self._mean_from_centre(state.centre)
+        after, innovation = condition_modes_on_received(x, deviation, output, z)
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise, zeta the products of x~ and functions of the modes.
 
-        `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
-
-        x~ = (x - centre, 1), and L the factor of Cov zeta.
+        x~ = (x - centre, 1). `slopes`: F L, L the factor of Cov zeta; the projection maps zeta to the plant's state
+        x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
-        return smoother_step_of(step, moved, self.claim, projection=projection)
+        slopes_and_noise = slopes, triangularise(noise)
+        return smoother_step_of(step, slopes_and_noise, self.claim, projection=self._projection_to_state())
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
         """Return the matrix (n, N) that maps zeta to x."""
@@ -240,14 +243,14 @@ def _next_laws(laws: Laws, rows: Laws) -> Laws:
     return tuple(law @ chain for law, chain in zip(laws, rows, strict=True))
 
 
-def _function_transition(rows: Laws) -> jax.Array:
+def _function_transition(transitions: Laws) -> jax.Array:
     """Return T of E[phi+ | phi] = T phi: block-diagonal of 1 and, chain by chain, Pi_ij - Pi_first,j.
 
-    phi: 1 and, of each chain, the indicators (less their probabilities) of its modes but the first; Pi: transition
-    matrix.
+    phi: 1 and, of each chain of modes, the indicators of its modes but the first, less their probabilities; Pi: a
+    chain's transition matrix.
     """
-    parts = [(chain[1:, 1:] - chain[:1, 1:]).T for chain in rows if len(chain) > 1]
-    matrix: jax.Array = block_diag(np.eye(1), *parts)
+    blocks = [(pi[1:, 1:] - pi[:1, 1:]).T for pi in transitions if len(pi) > 1]
+    matrix: jax.Array = block_diag(np.eye(1), *blocks)
     return matrix
 
 
@@ -261,22 +264,23 @@ def _second_moment_of_functions(laws: Laws) -> WeightedColumns:
     return _block_diagonal_columns(np.eye(1), [_indicator_covariance(law) for law in laws])
 
 
-def _block_diagonal_columns(one: np.ndarray, covariances: Sequence[jax.Array]) -> WeightedColumns:
+def _block_diagonal_columns(first_factor: np.ndarray, covariances: Sequence[jax.Array]) -> WeightedColumns:
     """Return the columns of blkdiag(one one', C_1, C_2, ...) for covariances C_i.
 
-    `one` (rows, columns): factor of the first block; an empty C_i adds nothing.
+    `first_factor` (rows, columns): factor of the first block; an empty C_i adds nothing.
     """
     factors = [factor_spread(covariance) for covariance in covariances if len(covariance)]
-    weights = jnp.concatenate([jnp.ones(one.shape[1]), *(factor.weights for factor in factors)])
+    weights = jnp.concatenate([jnp.ones(first_factor.shape[1]), *(factor.weights for factor in factors)])
     rows = sum(len(factor.matrix) for factor in factors)
     blocks: jax.Array = block_diag(*(factor.matrix for factor in factors)).reshape(rows, -1)
-    # Behind the first row block comes a row of zeros for the other columns.
-    top = jnp.concatenate([jnp.asarray(one), np.zeros((1, blocks.shape[1]))], axis=1)
-    return WeightedColumns(jnp.concatenate([top, jnp.pad(blocks, ((0, 0), (one.shape[1], 0)))]), weights)
+    # Right of the first factor, a row, are zeros, and left of the other blocks.
+    top = jnp.concatenate([jnp.asarray(first_factor), np.zeros((1, blocks.shape[1]))], axis=1)
+    below = jnp.pad(blocks, ((0, 0), (first_factor.shape[1], 0)))
+    return WeightedColumns(jnp.concatenate([top, below]), weights)
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
-    """Return the best linear filter behind the sum of these terms, each with all outputs, which share no memory."""
+    """Return the best linear filter behind a sum of links, its terms, which share no memory; each has all outputs."""
     laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)
@@ -285,8 +289,8 @@ def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Ch
 
 def independent_terms(channel: Channel) -> list[Channel]:
     """Return the terms of a sum that share no memory; a channel that is no sum, or of one term, is that term."""
-    steps = [split_terms_without_common_memory(step) for step in unstack(channel)]
+    terms_by_step = [split_terms_without_common_memory(step) for step in unstack(channel)]
     # Steps that split differently have no terms in common.
-    if len({len(terms) for terms in steps}) > 1 or len(steps[0]) == 1:
+    if len({len(terms) for terms in terms_by_step}) > 1 or len(terms_by_step[0]) == 1:
         return [channel]
-    return [vary_over_steps(parts, channel) for parts in zip(*steps, strict=True)]
+    return [vary_over_steps(term_at_each_step, channel) for term_at_each_step in zip(*terms_by_step, strict=True)]

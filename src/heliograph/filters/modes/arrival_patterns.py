@@ -45,18 +45,16 @@ class ChannelByPattern(Module):
 def describe_by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[ChannelByPattern]:
     """Return the channel at each step by mode and pattern of arrivals, the patterns being those of all steps.
 
-    `flags`: P(flag | mode).
-
-    A pattern says which components arrive. The transition to a step is that of the step before; the first step, which
-    has none before, takes its own.
+    A pattern says which components arrive; `flags`: P(flag | mode), a flag being a received number that tells of the
+    mode. The transition to a step is that of the step before; the first step, which has none before, takes its own.
     """
     outcomes_by_step = [[mode.list_outcomes() for mode in step.maps] for step in steps]
     distinct = {tuple(o.arrived) for modes in outcomes_by_step for outcomes in modes for o in outcomes}
     patterns = sorted(distinct, key=lambda pattern: (sum(pattern), pattern))  # those in which fewer arrive first
-    before = [steps[0], *steps[:-1]]
+    previous_steps = [steps[0], *steps[:-1]]
     return [
         _describe_step_by_pattern(outcomes, patterns, step_before, flags)
-        for outcomes, step_before in zip(outcomes_by_step, before, strict=True)
+        for outcomes, step_before in zip(outcomes_by_step, previous_steps, strict=True)
     ]
 
 
@@ -118,20 +116,22 @@ class HasPatterns(Protocol):
 def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:
     """Return the index of the smallest possible pattern in which all components that arrived arrive.
 
-    A larger one may have brought numbers that were left out as NaN. `present`: components by pattern; `chance`: by mode
-    and pattern.
+    A larger one may have brought numbers that were left out as NaN. `present` (pattern, component): what arrives;
+    `chance` (mode, pattern): probabilities.
     """
     present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
-    fits = jnp.all(present | ~arrived, axis=1) & possible
-    return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
+    is_candidate = jnp.all(present | ~arrived, axis=1) & possible
+    arrivals = jnp.sum(present, axis=1)
+    return jnp.argmin(jnp.where(is_candidate, arrivals, present.shape[1] + 1))
 
 
 def append_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the innovation of a flag, 0 as it is known, NaN if it is missing, and the covariance with it appended.
 
-    A flag is a number received that tells the mode of a link; its covariance is 0.
+    A flag is a received number that tells the mode of a link; its covariance is 0. Of what is missing the covariance
+    is NaN.
     """
     innovation = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
-    lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), innovation))
+    is_missing = jnp.isnan(jnp.append(jnp.diagonal(covariance), innovation))
     padded = jnp.pad(covariance, ((0, 1), (0, 1)))
-    return innovation, jnp.where(lost[:, None] | lost, jnp.nan, jnp.nan_to_num(padded))
+    return innovation, jnp.where(is_missing[:, None] | is_missing, jnp.nan, jnp.nan_to_num(padded))

@@ -122,10 +122,9 @@ class MixtureFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> MixtureBelief:
-        """Return the prior, and the initial law of the modes."""
-        start = at(self.plant, 0)
+        """Return the prior, and the initial law of the modes; `moved`: no step was predicted yet."""
+        start = at(self.plant, k=0)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
-        # moved: no step was predicted
         return MixtureBelief(gaussian=prior, law=jnp.asarray(self.initial), moved=jnp.asarray(False))
 
     @predicts
@@ -133,9 +132,9 @@ class MixtureFilter(AbstractSizedFilter):
         """Return A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
-        moved = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
+        predicted = predict_affine(state.gaussian, plant.transition_matrix(u), plant.shift(u), noise)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
-        return MixtureBelief(gaussian=moved, law=law, moved=jnp.asarray(True))
+        return MixtureBelief(gaussian=predicted, law=law, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
@@ -193,16 +192,16 @@ class MixtureFilter(AbstractSizedFilter):
         return smoother_step_of(step, (slopes, noise), "nominal", plant.manifold)
 
 
-def drop_below_point_mass(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
+def drop_below_point_mass(log_likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
     """Return log-likelihoods, -inf for combinations whose density another one's point mass outweighs.
 
     `certain` counts the components that a combination determines exactly: it has a point mass there, against which a
     density is negligible.
     """
-    agrees = jnp.isfinite(likelihood)
+    agrees = jnp.isfinite(log_likelihood)
     # -1: no combination agrees with z.
-    most = jnp.max(jnp.where(agrees, certain, -1))
-    return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
+    largest_count = jnp.max(jnp.where(agrees, certain, -1))
+    return jnp.where(agrees & (certain < largest_count), -jnp.inf, log_likelihood)
 
 
 @accept_limits
@@ -237,7 +236,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
     # All combinations of atoms, mode by mode, for each step where they vary; one step stands for all where none do.
-    added_variance = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2
+    added_variance = float(scalar("resolution", resolution, low=0.0, high=1e100)) ** 2
     steps = steps_covered((sensor, channel)) or 1
     modes = [_joint_modes_of(now) for now in list_models_by_step(channel, steps)]
     modes_before = [modes[0], *modes[:-1]]

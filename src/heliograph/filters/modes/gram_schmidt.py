@@ -11,7 +11,7 @@ from heliograph.numerics.linalg import outer
 def orthogonalise_first_rows(
     rows: jax.Array, numbers: jax.Array, weights: jax.Array, count: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Subtract from each row its projections on those of the first `count` rows that are above it.
+    """Subtract from each row its projections on those of the first `count` rows that are above it (Gram-Schmidt).
 
     Args:
         rows: random numbers (k, columns), of which products a W b', W = diag(weights), are second moments.
@@ -27,6 +27,7 @@ def orthogonalise_first_rows(
         weighted = weights * rows[i]
         variances.append(rows[i] @ weighted)
         # Only rows below row i change; a row without variance has no projection.
-        share = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
-        rows, numbers = rows - outer(share, rows[i]), numbers - share * numbers[i]
+        multiples = jnp.where(np.arange(len(rows)) > i, rows @ weighted * reciprocal_or_zero(variances[i]), 0.0)
+        rows = rows - outer(multiples, rows[i])
+        numbers = numbers - multiples * numbers[i]
     return rows, numbers, jnp.stack(variances)

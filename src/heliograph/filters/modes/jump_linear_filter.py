@@ -32,6 +32,7 @@ from heliograph.filters.base import AbstractFilter, AbstractSizedFilter, Step, c
 from heliograph.filters.gaussian.gaussian_prediction import second_moments_at_start
 from heliograph.filters.gaussian.signal_moments import condition_on_measurement, factor_spread
 from heliograph.filters.linear.precomputed_filter import plan_filter
+from heliograph.filters.modes.channel_by_mode import ChannelByMode, channels_by_mode
 from heliograph.filters.modes.linear_by_mode import (
     MotionByMode,
     centred_motion,
@@ -46,38 +47,13 @@ from heliograph.linear.jump_system import mix_moments_of_modes, propagate_by_mod
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
 from heliograph.model.markov_jump_models import list_mode_models
-from heliograph.model.over_time import OverTime, at, first, unstack, vary_over_steps
+from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.linalg import outer
-from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import stack_parts
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
 from heliograph.random_affine.memories_of_channels import drop_names
-from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
-
-
-class ChannelByMode(Module):
-    """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
-
-    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
-    gain_spread and noise: as in `SecondOrder`, for each mode.
-
-    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_spread (M, m, m, p + 1, p + 1), noise (M, m, m).
-    """
-
-    transition: Float[Array, "M M"]
-    radius: Float[Array, "M M"]
-    mean: Float[Array, "M m p1"]
-    gain_spread: Float[Array, "M m m p1 p1"]
-    noise: WeightedColumns
-
-    @property
-    def spread(self) -> Float[Array, "M m m p1 p1"]:
-        """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
-        spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
-        return spread
+from heliograph.random_affine.modes import joint_modes
 
 
 class ModalBelief(NamedTuple):
@@ -165,10 +141,13 @@ class ModalFilter(AbstractJointModalFilter):
 
     @compile_on_call
     def init(self) -> ModalBelief:
-        """Return the prior of x 1{mode} in each mode; state and mode are independent."""
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        prior, second = compute_initial_moments(start, self.initial)
-        moments, centre = law[:, None, None] * second, jnp.asarray(start.initial_mean)
+        """Return the prior of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1).
+
+        State and mode are independent at the start.
+        """
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
+        prior, second_moment = compute_initial_moments(start, self.initial)
+        moments, centre = law[:, None, None] * second_moment, jnp.asarray(start.initial_mean)
         return ModalBelief(gaussian=prior, moments=moments, centre=centre, moved=jnp.asarray(False))
 
     @predicts
@@ -179,15 +158,17 @@ class ModalFilter(AbstractJointModalFilter):
 
         zeta: x~ = (x - c, 1) times each mode's indicator; E_i = E[x~ x~' 1{i}]; Pi: the chain; A~, Q~: the plant.
         """
-        rows = self._transition_matrix(state, k)
-        arriving, motion = mix_moments_of_modes(rows, state.moments), self._motion(state, u, k)
-        law = arriving[:, -1, -1]
+        transition = self._transition_matrix(state, k)
+        moments_before_motion, motion = mix_moments_of_modes(transition, state.moments), self._motion(state, u, k)
+        law = moments_before_motion[:, -1, -1]
         # F zeta about the moving centre.
-        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        mean = predict_by_mode(centred[:, None], motion.moves, rows)[:, 0] + mean_from_centre(law, motion.centre)
+        deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
+        mean = predict_by_mode(deviation[:, None], motion.moves, transition)[:, 0] + mean_from_centre(
+            law, motion.centre
+        )
         root, noise = self._transition_factors(state, u, k)
         after = from_columns(mean, join_columns(WeightedColumns(root, state.gaussian.variances), noise))
-        moments = propagate_by_mode(motion.moves, arriving, law[:, None, None] * motion.noises)
+        moments = propagate_by_mode(motion.moves, moments_before_motion, law[:, None, None] * motion.noises)
         return ModalBelief(gaussian=after, moments=moments, centre=motion.centre, moved=jnp.asarray(True))
 
     @corrects
@@ -199,8 +180,9 @@ class ModalFilter(AbstractJointModalFilter):
 
         zeta: x~ = (x - c, 1) times each mode's indicator; E_j = E[x~ x~' 1{j}]; C~, R~: the sensor; Hbar: mean gain.
         """
-        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        after, innovation = condition_modes_on_received(state.gaussian, centred, self._measurement_model(state, k), z)
+        deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
+        output = self._measurement_model(state, k)
+        after, innovation = condition_modes_on_received(state.gaussian, deviation, output, z)
         return state._replace(gaussian=after), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
@@ -209,14 +191,20 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
         """Return F L of zeta = E zeta + L xi, zeta the state times each mode's indicator, and columns of its noise."""
-        rows, moves, plants = self._transition_matrix(state, k), self._motion(state, u, k).moves, self._plants(k)
-        # What the chain draws moves in its mode.
-        among = mode_transition_covariance(state.moments, rows)
-        parts = among.matrix.reshape(*moves.shape[:2], -1)
-        drawn = WeightedColumns((moves @ parts).reshape(among.matrix.shape), among.weights)
+        transition, matrices, plants = (
+            self._transition_matrix(state, k),
+            self._motion(state, u, k).moves,
+            self._plants(k),
+        )
+        # The noise by which the chain draws the next mode, moved by the plant of that mode.
+        chain_noise = mode_transition_covariance(state.moments, transition)
+        by_mode = chain_noise.matrix.reshape(*matrices.shape[:2], -1)
+        moved_chain_noise = WeightedColumns((matrices @ by_mode).reshape(chain_noise.matrix.shape), chain_noise.weights)
         start = second_moments_at_start(self.plant)
-        of_process = noise_by_mode(plants, self.plant_modes, u, start, state.law @ rows)
-        return predict_by_mode(state.gaussian.root, moves, rows), join_columns(drawn, of_process)
+        process_noise = noise_by_mode(plants, self.plant_modes, u, start, state.law @ transition)
+        return predict_by_mode(state.gaussian.root, matrices, transition), join_columns(
+            moved_chain_noise, process_noise
+        )
 
     def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
         """Return the laws of motion of a step."""
@@ -229,17 +217,18 @@ class ModalFilter(AbstractJointModalFilter):
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
         """Return z = common + H zeta + v, zeta the state times each mode's indicator, and columns of Cov v."""
-        channel, sensors, law = at(self.channel, k), list_mode_models(at(self.sensor, k)), state.law
+        channel, law = at(self.channel, k), state.law
+        sensors = list_mode_models(at(self.sensor, k))
         measure, noise = centred_sensing(sensors, self.sensor_modes, state.centre)
         gains = jnp.asarray(channel.mean)
-        matrix, common = subtract_mean_output(gains @ measure, law)
+        matrix, mean_output = subtract_mean_output(gains @ measure, law)
         # E[y~ y~' 1{mode j}] of what is sent (M, p + 1, p + 1), and the spread of the gains on it (m, m).
         sent = propagate_by_mode(measure, state.moments, law[:, None, None] * noise)
         gain_noise = factor_spread(jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.gain_spread), sent))
         # Noise of sensor and links, in the mean over the modes, and rounding.
-        plain = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
+        known_noise = factor_known_noise(channel, [sensors[mode].noise.columns for mode in self.sensor_modes], law)
         rounding = rounding_of_received(gains, sent)
-        return MeasurementModel(concatenate_modes(matrix), common, join_columns(plain, rounding, gain_noise))
+        return MeasurementModel(concatenate_modes(matrix), mean_output, join_columns(known_noise, rounding, gain_noise))
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise, zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...).
@@ -247,8 +236,8 @@ class ModalFilter(AbstractJointModalFilter):
         `slopes`: F L of zeta = E zeta + L xi; the projection maps zeta to the plant's state x.
         """
         slopes, noise = self._transition_factors(step.before, step.u, step.k)
-        moved, projection = (slopes, triangularise(noise)), self._projection_to_state()
-        return smoother_step_of(step, moved, self.claim, projection=projection)
+        slopes_and_noise = slopes, triangularise(noise)
+        return smoother_step_of(step, slopes_and_noise, self.claim, projection=self._projection_to_state())
 
 
 def predict_by_mode(columns: jax.Array, moves: jax.Array, rows: jax.Array) -> jax.Array:
@@ -267,14 +256,15 @@ def covariance_of_mode(rows: jax.Array) -> jax.Array:
     return rows[:, :, None] * (np.eye(rows.shape[1]) - rows[:, None, :])
 
 
-def factor_with_last_mode(among: jax.Array) -> WeightedColumns:
+def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance over all M modes, whose parts of size s sum to zero over the modes.
 
-    `among` (M - 1, s, M - 1, s): the covariance of all modes but the last, whose part is minus the sum of theirs.
+    `covariance` (M - 1, s, M - 1, s): that of all modes but the last, whose part is minus the sum of theirs.
     """
-    others, size = among.shape[:2]
-    factors = factor_spread(among.reshape(others * size, others * size))
-    return factors.through(np.concatenate([np.eye(others * size), -np.tile(np.eye(size), (1, others))]))
+    other_modes, size = covariance.shape[:2]
+    factors = factor_spread(covariance.reshape(other_modes * size, other_modes * size))
+    minus_sum = -np.tile(np.eye(size), (1, other_modes))
+    return factors.through(np.concatenate([np.eye(other_modes * size), minus_sum]))
 
 
 def factor_known_noise(channel: ChannelByMode, sent: Sequence[WeightedColumns], law: jax.Array) -> WeightedColumns:
@@ -296,6 +286,7 @@ def kron(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return the Kronecker product of a and b, by a matrix product, which keeps known zeros."""
     a, b = jnp.asarray(a), jnp.asarray(b)
     products = outer(a.reshape(-1), b.reshape(-1)).reshape(*a.shape, *b.shape)
+    # products[i, j, k, l] = a_ij b_kl goes to row (i, k), column (j, l).
     return products.swapaxes(1, 2).reshape(len(a) * len(b), -1)
 
 
@@ -305,14 +296,15 @@ def make_mode_sum_matrix(n: int, modes: int) -> Float[np.ndarray, "n N"]:
 
 
 def condition_modes_on_received(
-    x: Gaussian, centred: jax.Array, output: MeasurementModel, z: ArrayLike
+    x: Gaussian, deviation: jax.Array, output: MeasurementModel, z: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
     """Return zeta, the state times the indicator of each mode, given the components of z that arrived; the innovation.
 
-    `centred`: the mean of zeta less P(mode) c, c the centre. `output`: z = common + matrix zeta + noise.
+    `deviation`: the mean of zeta less P(mode) c, c the centre. `output`: z = common + matrix zeta + noise.
     """
-    expected = output.common + output.matrix @ centred
-    return condition_on_measurement(x, output.matrix @ x.root, output.noise, jnp.asarray(z), expected)
+    expected = output.common + output.matrix @ deviation
+    slopes = output.matrix @ x.root
+    return condition_on_measurement(x, slopes, output.noise, jnp.asarray(z), expected)
 
 
 def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, jax.Array]:
@@ -320,17 +312,17 @@ def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, j
 
     Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1): x and the mode are independent.
     """
-    spread, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    covariance, law = pad_with_zeros(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
     state = from_covariance(start.initial_mean, start.initial_covariance)
     mode = factor_with_last_mode((jnp.diag(law) - jnp.outer(law, law))[:-1, None, :-1, None])
-    # Factors of both, x before the indicator in each part.
-    last = np.zeros((len(spread), len(spread)))
-    last[-1, -1] = 1.0
-    ends = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
-    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(ends, last)
+    # Factors of both, x before the indicator in each part; `unit_moment` is e e'.
+    unit_moment = np.zeros((len(covariance), len(covariance)))
+    unit_moment[-1, -1] = 1.0
+    mode_root = jnp.pad(mode.matrix, ((0, 0), (0, 1))).at[-1, -1].set(1.0)
+    root = jnp.kron(np.eye(len(law)), pad_with_zeros(state.root)) + jnp.kron(mode_root, unit_moment)
     variances = jnp.concatenate([jnp.outer(law, state.variances), jnp.append(mode.weights, 0.0)[:, None]], axis=1)
     prior = Gaussian(jnp.kron(law, jnp.append(state.mean, 1.0)), below_diagonal(root), variances.reshape(-1))
-    return prior, spread + last
+    return prior, covariance + unit_moment
 
 
 def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
@@ -341,10 +333,11 @@ def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
 def subtract_mean_output(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Subtract the mean output over the modes, as the indicators sum to 1; return what is left and the mean output.
 
-    Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
+    `output` (M, m, n + 1): E[z 1{mode}] as a matrix of (x, 1); `law` (M,): probabilities of the modes. The mean is
+    (m,).
     """
-    common = law @ output[:, :, -1] / jnp.sum(law)
-    return output.at[:, :, -1].add(-common), common  # output: E[z 1{mode}] by (x, 1)
+    mean_output = law @ output[:, :, -1] / jnp.sum(law)
+    return output.at[:, :, -1].add(-mean_output), mean_output
 
 
 def concatenate_modes(output: jax.Array) -> jax.Array:
@@ -371,26 +364,6 @@ def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, 
     """Return the channel's observation models by mode, and the sizes, of a filter of joint modes."""
     initial, described = channels_by_mode(channel, (first(plant), first(sensor)))
     return {"channel": described, "initial": initial, **make_sizes(claim, first(plant), first(channel).outputs)}
-
-
-def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
-    """Return the law of the modes at the first step, and the channel by mode; links without memory have one mode.
-
-    `beside`: plant and sensor, whose modes come before the channel's.
-    """
-    steps = [joint_modes(c, beside=beside) for c in unstack(channel)]
-    models = [channel_by_mode(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    return steps[0].initial, vary_over_steps(models, channel)
-
-
-def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
-    """Return the moments of the channel by mode at one step, and the transition from the step before."""
-    mean = stack_parts([m.moments(1).mean[:-1] for m in now.maps])
-    gains, noises = zip(*(split_off_noise(nominal_spread(m).center) for m in now.maps), strict=True)
-    noise = WeightedColumns(*(stack_parts(part) for part in zip(*noises, strict=True)))
-    return ChannelByMode(
-        transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
-    )
 
 
 def claim_of_modes(channel: Channel) -> Claim:

@@ -47,10 +47,10 @@ def noise_in_mode(plant: LinearPlant, u: ArrayLike, start: jax.Array) -> Weighte
 
     `start`: E[x_i^2] at the start, the size of numbers that rounding acts on.
     """
-    w = factor_process_noise(plant, jnp.asarray(u), start)
+    process_noise = factor_process_noise(plant, jnp.asarray(u), start)
     of_indicator = rounding_of(np.ones(1))
-    matrix = jax.scipy.linalg.block_diag(w.matrix, of_indicator.matrix)
-    return WeightedColumns(matrix, jnp.append(w.weights, of_indicator.weights))
+    matrix = jax.scipy.linalg.block_diag(process_noise.matrix, of_indicator.matrix)
+    return WeightedColumns(matrix, jnp.append(process_noise.weights, of_indicator.weights))
 
 
 def pad_with_zeros(a: jax.Array) -> jax.Array:
@@ -70,7 +70,7 @@ class MotionByMode(NamedTuple):
 
 
 def centred_motion(
-    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, centre: jax.Array, arriving: jax.Array
+    plants: Sequence[LinearPlant], modes: Sequence[int], u: ArrayLike, centre: jax.Array, moments_before: jax.Array
 ) -> MotionByMode:
     """Return how x - c moves in each mode, and the next centre: E[x+] before any data.
 
@@ -82,7 +82,7 @@ def centred_motion(
         modes: which of them each mode has.
         u: input (inputs,).
         centre: c (n,).
-        arriving: E[(x - c, 1) 1{mode j}] of the mode that moves (M, n + 1).
+        moments_before: E[(x - c, 1) 1{mode j}] of the mode that moves (M, n + 1).
     """
     by_plant = [transition_with_constant(plant, jnp.asarray(u)) for plant in plants]
     moves, noises = (jnp.stack(matrices) for matrices in zip(*(by_plant[mode] for mode in modes), strict=True))
@@ -90,10 +90,10 @@ def centred_motion(
     if len(plants) == 1:
         return MotionByMode(moves.at[:, :-1, -1].set(0.0), noises, at_centre[0])
     # E[x+ 1{j}] = A_j E[(x - c) 1{j}] + P(j) (A_j c + B_j u + E w_j).
-    law = arriving[:, -1:]
-    means = jnp.einsum("jab,jb->ja", moves[:, :-1, :-1], arriving[:, :-1]) + law * at_centre
-    after = jnp.sum(means, axis=0) / jnp.sum(law)
-    return MotionByMode(moves.at[:, :-1, -1].set(at_centre - after), noises, after)
+    law = moments_before[:, -1:]
+    means = jnp.einsum("jab,jb->ja", moves[:, :-1, :-1], moments_before[:, :-1]) + law * at_centre
+    centre_after = jnp.sum(means, axis=0) / jnp.sum(law)
+    return MotionByMode(moves.at[:, :-1, -1].set(at_centre - centre_after), noises, centre_after)
 
 
 def noise_by_mode(
@@ -105,11 +105,10 @@ def noise_by_mode(
 
     `start`: E[x_i^2] at the start, for rounding.
     """
-    parts = [noise_in_mode(plant, u, start) for plant in plants]
-    matrix = jax.scipy.linalg.block_diag(*(parts[mode].matrix for mode in modes))
-    return WeightedColumns(
-        matrix, jnp.concatenate([p * parts[mode].weights for p, mode in zip(law, modes, strict=True)])
-    )
+    noises = [noise_in_mode(plant, u, start) for plant in plants]
+    matrix = jax.scipy.linalg.block_diag(*(noises[mode].matrix for mode in modes))
+    weights = jnp.concatenate([p * noises[mode].weights for p, mode in zip(law, modes, strict=True)])
+    return WeightedColumns(matrix, weights)
 
 
 def centred_sensing(

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.module import Module, unwritten
+from heliograph.numerics.types import PyTree
+
+T = TypeVar("T", bound=PyTree)
 
 
 class AbstractMerging(Module):
@@ -102,12 +105,13 @@ class MergeByMode(AbstractMerging):
     def keep_components(self, parts: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
         """Return one component for each present mode, merged over the modes before, and the weights (M, M).
 
-        `weight`: of each pair of the mode before and the present one, one component each; the weights returned are
-        diagonal.
+        `parts`, `weight`: a Gaussian and its weight for each pair (mode before, present mode). A component holds the
+        weight of its own mode alone: the weights returned are diagonal.
         """
-        pairs = weight[:, None] * (self.list_update_pairs(modes)[1][:, None] == np.arange(modes))
-        merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(pairs))
-        return merged, jnp.diag(jnp.sum(pairs, axis=0))
+        _, present_mode = self.list_update_pairs(modes)
+        weight_by_mode = weight[:, None] * (present_mode[:, None] == np.arange(modes))  # (pair, present mode)
+        merged = jax.vmap(partial(merge_mixture, parts), in_axes=1)(normalise_columns(weight_by_mode))
+        return merged, jnp.diag(jnp.sum(weight_by_mode, axis=0))
 
 
 class MergePairs(AbstractMerging):
@@ -151,9 +155,9 @@ class MergePairs(AbstractMerging):
 
 def normalise_columns(weight: jax.Array) -> jax.Array:
     """Divide weights (components, mixtures) by their column sums; equal weights where a column is zero."""
-    law = jnp.sum(weight, axis=0)
-    positive = law > float(np.finfo(law.dtype).tiny)  # the reciprocal of less is infinite
-    return jnp.where(positive, weight * (1 / jnp.where(positive, law, 1.0)), 1 / len(weight))
+    total = jnp.sum(weight, axis=0)
+    is_positive = total > float(np.finfo(total.dtype).tiny)  # the reciprocal of less is infinite
+    return jnp.where(is_positive, weight * (1 / jnp.where(is_positive, total, 1.0)), 1 / len(weight))
 
 
 def mix_and_predict(
@@ -245,9 +249,13 @@ class MixtureMoments(NamedTuple):
 def mix_moments(parts: Gaussian, share: jax.Array) -> MixtureMoments:
     """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
     covariances = jax.vmap(lambda x: x.covariance)(parts)
-    return MixtureMoments(
-        *jax.vmap(lambda weights: moments_of_mixture(parts.mean, covariances, weights), in_axes=1)(share)
-    )
+
+    def mix(shares: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return mean and covariance of the mixture with these shares of the components."""
+        return moments_of_mixture(parts.mean, covariances, shares)
+
+    mean, covariance = jax.vmap(mix, in_axes=1)(share)
+    return MixtureMoments(mean, covariance)
 
 
 def _predict_each(
@@ -274,3 +282,9 @@ def _predict_each(
 def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
     """Return means (components, n) with angles near those of the most probable component, so that they average."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
+
+
+def replicate(x: T, count: int) -> T:
+    """Replicate an object `count` times along a new first axis."""
+    copies: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
+    return copies

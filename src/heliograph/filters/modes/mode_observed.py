@@ -80,16 +80,15 @@ class ModeObservedFilter(AbstractSizedFilter):
 
         Nothing was received (z is NaN), and the last step moved nothing (matrix I, no noise).
         """
-        belief = prior_belief(at(self.plant, 0))
+        belief = prior_belief(at(self.plant, k=0))
         n = len(belief.gaussian.mean)
         zeros = jnp.zeros((n, n))
+        no_noise = WeightedColumns(zeros, jnp.zeros(n))
         return ModeObservedBelief(
             belief=belief,
             before=belief,
             z=jnp.full(first(self.channel).outputs, jnp.nan),
-            move=PlantMotion(
-                matrix=jnp.eye(n), shift=jnp.zeros(n), covariance=zeros, noise=WeightedColumns(zeros, jnp.zeros(n))
-            ),
+            move=PlantMotion(matrix=jnp.eye(n), shift=jnp.zeros(n), covariance=zeros, noise=no_noise),
             begun=jnp.asarray(False),
         )
 
@@ -133,29 +132,27 @@ class ModeObservedFilter(AbstractSizedFilter):
         return belief, Innovation(value, spread, innovation.log_likelihood)
 
     def _redo_last_step(self, state: ModeObservedBelief, memory_states: jax.Array, k: Step) -> LinearBelief:
-        """Return the prior of step k after the last measurement is used again, given the memories' states then.
+        """Return the prior of step k after the last measurement is used again, with what was learned since.
 
         The states of the links' memories are received one step late: then the last correction can be made with the
-        moments given them.
+        channel's moments given them.
         """
-        last = jnp.maximum(jnp.asarray(k) - 1, 0)
-        channel = _find_moments_given_states(at(self.channel, last), memory_states)
+        last_step = jnp.maximum(jnp.asarray(k) - 1, 0)
+        channel = _find_moments_given_states(at(self.channel, last_step), memory_states)
         start = second_moments_at_start(self.plant)
-        redone, _ = correct_linear(state.before, at(self.sensor, last), channel, Polytope(), state.z, start)
-        return predict_belief(redone, state.move)
+        corrected, _ = correct_linear(state.before, at(self.sensor, last_step), channel, Polytope(), state.z, start)
+        return predict_belief(corrected, state.move)
 
     def _describe_channel_after(self, begun: jax.Array, memory_states: jax.Array, k: Step) -> SecondOrder:
-        """Return the channel's moments at step k given the memories' states one step before, at the first step without.
+        """Return the channel's moments at step k given the memories' states one step before; at the first step none.
 
-        `begun`: whether there was a step before.
-
-        A memory is what a link remembers (such as its mode). Both are computed, and one is taken.
+        `begun`: whether a step was before. A memory is what a link remembers, such as its mode.
         """
-        channel, last = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
-        following = _find_moments_given_earlier_states(at(self.channel, last), channel, memory_states)
-        of_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
-        described: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), following, of_first_step)
-        return described
+        channel, last_step = at(self.channel, k), jnp.maximum(jnp.asarray(k) - 1, 0)
+        at_later_step = _find_moments_given_earlier_states(at(self.channel, last_step), channel, memory_states)
+        at_first_step = _find_moments_given_earlier_states(None, channel, memory_states)
+        moments: SecondOrder = jax.tree.map(lambda a, b: jnp.where(begun, a, b), at_later_step, at_first_step)
+        return moments
 
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:

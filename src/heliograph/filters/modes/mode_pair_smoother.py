@@ -78,16 +78,16 @@ def move_pairs(
     """
 
     def move(plant: AbstractPlant, x: Gaussian) -> MovedPairs:
-        """Move one Gaussian by one plant: f(x, u) by its slopes in x, and what these do not explain.
+        """Move one Gaussian x by one plant: return the law of f(x, u) + w, and x given the next state.
 
-        `transform`: moments of a nonlinear f; u: input; `start`: E[x_i^2] at the start, for rounding. It returns the
-        law of the next state, and x given it.
+        f(x, u) is known by its slopes in x and what these do not explain. `transform`: moments of a nonlinear f; u:
+        input; `start`: E[x_i^2] at the start, for rounding.
         """
         image = find_transition_moments(plant, transform, x, u)
-        rest = sum_unexplained(image, factor_process_noise(plant, u, start))
+        unexplained = sum_unexplained(image, factor_process_noise(plant, u, start))
         mean = image.mean + plant.noise_mean()
-        predicted = from_columns(mean, join_columns(image.explained, rest))
-        return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, rest))
+        predicted = from_columns(mean, join_columns(image.explained, unexplained))
+        return MovedPairs(predicted, condition_on_next_state(x, image.slopes, mean, unexplained))
 
     # Each Gaussian moved by each plant, [i, plant]; then for each mode j the one by its plant, [i, j].
     by_plant = [jax.vmap(lambda x, plant=plant: move(plant, x))(parts) for plant in plants]
@@ -170,12 +170,13 @@ class ModalSmootherStep(SmootherStep):
         observations = jax.vmap(divide_gaussians)(later.gaussian._replace(mean=near), self.known)
 
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
-            """Condition one pair on what the future says of its later mode; return it and the log-likelihood.
+            """Condition one pair (mode, next mode) on what later data say of it; return it and the log-likelihood.
 
-            A pair: a mode and the next one. The future says value = rows x + noise, as if measured.
+            Later data say value = rows x + noise, as if this were measured.
             """
-            noise, expected = WeightedColumns(jnp.eye(len(x.mean)), observed.noise), observed.rows @ x.mean
-            after, innovation = condition_on_measurement(x, observed.rows @ x.root, noise, observed.value, expected)
+            noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
+            expected, slopes = observed.rows @ x.mean, observed.rows @ x.root
+            after, innovation = condition_on_measurement(x, slopes, noise, observed.value, expected)
             return after, jnp.asarray(innovation.log_likelihood)
 
         after, score = jax.vmap(jax.vmap(observe), in_axes=(0, None))(self.pairs, observations)
@@ -202,18 +203,19 @@ class ModalSmootherStep(SmootherStep):
             return super().estimate_from(law)
         parts = law.gaussian
         if self.limits:
-            held = jax.vmap(lambda x: hold_mean_within_limits(x, self.limits))(parts)
-            log_mass, parts = truncate_to_limits(held, self.limits)
+            within_limits = jax.vmap(lambda x: hold_mean_within_limits(x, self.limits))(parts)
+            log_mass, parts = truncate_to_limits(within_limits, self.limits)
             weight = law.law * jnp.exp(log_mass - jnp.max(log_mass))
             law = ModalLaw(parts, weight / jnp.sum(weight))
         # Angles of all modes within half a turn of those of the likeliest.
         mean = wrap_near(parts.mean, parts.mean[jnp.argmax(law.law)], self.angles)
-        mean, covariance = moments_of_mixture(mean, jax.vmap(lambda x: x.covariance)(parts), law.law)
+        covariances = jax.vmap(lambda x: x.covariance)(parts)
+        mean, covariance = moments_of_mixture(mean, covariances, law.law)
         return Estimate(wrap_angles(mean, self.angles), covariance, self.claim, law.law)
 
     def start(self) -> EarlierState:
-        """Return the state after this step as an earlier state that is yet to be carried ahead."""
-        # None: several plants, where no one function moves the whole mixture.
+        """Return the state after this step as an earlier state, whose law is then carried from step to step."""
+        # `before` is None for several plants, where no one function moves the whole mixture.
         if self.before is None:
             raise fail("smoothing of plants with modes", "FixedInterval or FixedLag", "a fixed point")
         return super().start()

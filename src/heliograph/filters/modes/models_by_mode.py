@@ -25,14 +25,14 @@ def describe_joint_modes(
 
     `nodes`: number of modes that stand for a gain that drifts.
     """
-    steps = [joint_modes(c, nodes, beside=(plant, sensor)) for c in unstack(channel)]
+    steps = [joint_modes(step, nodes, beside=(plant, sensor)) for step in unstack(channel)]
     modes = len(steps[0].initial)
-    parts = describe_by_pattern(steps, np.ones((modes, 1)))  # no flag tells the mode
+    by_pattern = describe_by_pattern(steps, np.ones((modes, 1)))  # no flag tells the mode
     if modes > 1:
-        for step in parts:
+        for step in by_pattern:
             _check_density(step)
     # The chain is the same at each step; what it does to the signal may differ.
-    return steps[0], vary_over_steps(parts, channel)
+    return steps[0], vary_over_steps(by_pattern, channel)
 
 
 def _check_density(channel: ChannelByPattern) -> None:
@@ -42,9 +42,9 @@ def _check_density(channel: ChannelByPattern) -> None:
     """
     for j, a in np.argwhere(np.asarray(channel.chance) > 0):
         # M M' plus the spread at Y = I is regular where every combination of the rows that arrive is random.
-        rows, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
-        second = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a])))[np.ix_(rows, rows)]
-        if np.linalg.matrix_rank(second) < len(rows):
+        arriving, gain = np.flatnonzero(channel.present[a]), np.asarray(channel.mean[j, a])[:, :-1]
+        second_moment = gain @ gain.T + np.einsum("ilaa->il", np.asarray(channel.spread[j, a]))
+        if np.linalg.matrix_rank(second_moment[np.ix_(arriving, arriving)]) < len(arriving):
             raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 
 
@@ -57,7 +57,8 @@ def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")
     if not isinstance(model, ModalPlant | ModalSensor):
         return (0,) * len(by_mode)
-    return tuple(next(i for i, known in enumerate(model.models) if known is one) for one in by_mode)
+    number_of_model = {id(candidate): i for i, candidate in reversed(list(enumerate(model.models)))}
+    return tuple(number_of_model[id(of_mode)] for of_mode in by_mode)
 
 
 def fields_of_mode_filters(

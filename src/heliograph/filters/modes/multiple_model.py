@@ -5,7 +5,7 @@ They differ in when Gaussians are merged; all reduce a mixture to two moments, s
 """
 
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,6 +50,7 @@ from heliograph.filters.modes.mixing import (
     MergePairs,
     align_angles,
     mix_and_predict_by_mode,
+    replicate,
 )
 from heliograph.filters.modes.mode_pair_smoother import ModalLaw, ModalSmootherStep, move_pairs
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
@@ -63,9 +64,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.premises.premise import believes
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrap_angles, wrap_near
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float, PyTree
-
-T = TypeVar("T", bound=PyTree)
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 
 def correct_in_every_mode(
@@ -109,11 +108,14 @@ def correct_in_every_mode(
 def _correct_in_mode(
     signal: Signal, mean: jax.Array, gain_spread: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal in one mode of the channel, of moments as in `SecondOrder`."""
-    expected = mean[:, :-1] @ signal.mean + mean[:, -1]
+    """Correct the prior of a signal y with z = G y + n in one mode of the channel, of which `mean` is E[(G, n)].
+
+    `gain_spread`, `link`: covariance of G and columns of Cov n; `angles`: components of z.
+    """
+    gain = mean[:, :-1]
+    expected = gain @ signal.mean + mean[:, -1]
     z = wrap_near(z, expected, angles)
-    # mean: E[(G, n)], z = G y + n
-    slopes, noise = mean[:, :-1] @ signal.slopes, noise_behind_gain(signal, mean[:, :-1], gain_spread, link)
+    slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_spread, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)
 
 
@@ -178,10 +180,10 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> ModalBeliefs:
-        """Return the prior in every component, and the initial law of the modes."""
-        start, weight = at(self.plant, 0), self.merging.initial_weights(jnp.asarray(self.initial))
-        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
-        return ModalBeliefs(parts, weight, jnp.asarray(False))  # moved: no step was predicted
+        """Return the prior in every component, and the initial law of the modes; no step was predicted (`moved`)."""
+        start, weight = at(self.plant, k=0), self.merging.initial_weights(jnp.asarray(self.initial))
+        gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
+        return ModalBeliefs(gaussians, weight, moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
@@ -208,13 +210,19 @@ class MultipleModelFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
-        """Correct each component in each mode with z, and weight them by their likelihood."""
+        """Correct each component in each mode with z, and weight them by their likelihood.
+
+        `updating_mode`: of each pair (component, mode) the mode in which it is updated.
+        """
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
-        _, j = self.merging.list_update_pairs(modes)  # the mode in which each component is updated
-        (signal, weights), plant = self.prior_signals(state, k), list_mode_models(at(self.plant, k))[0]
-        after, weight, mixed = correct_in_every_mode(signal, channel, jnp.asarray(j), weights, z, self.observed_angles)
-        parts = after._replace(mean=align_angles(plant, after.mean, weight))
-        return ModalBeliefs(*self.merging.keep_components(parts, weight, modes), state.moved), mixed
+        _, updating_mode = self.merging.list_update_pairs(modes)
+        signal, weights = self.prior_signals(state, k)
+        plant = list_mode_models(at(self.plant, k))[0]  # all models have the same angles
+        after, weight, innovation = correct_in_every_mode(
+            signal, channel, jnp.asarray(updating_mode), weights, z, self.observed_angles
+        )
+        gaussians = after._replace(mean=align_angles(plant, after.mean, weight))
+        return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
         """Return the signal of each pair (component, mode) that is corrected, and its weight before."""
@@ -246,15 +254,15 @@ class MultipleModelFilter(AbstractSizedFilter):
     @estimates
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Return the mean and covariance of the whole mixture, angles between -pi and pi, and the modes' law."""
-        weights, parts = state.components
-        mean, covariance = moments_of_mixture(parts.mean, parts.covariance, weights)
+        weights, gaussians = state.components
+        mean, covariance = moments_of_mixture(gaussians.mean, gaussians.covariance, weights)
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim, state.law)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the step of smoothing by pairs of modes, with the moments of the whole mixture around the update."""
         plants, modes = list_mode_models(at(self.plant, step.k)), len(self.initial)
         law = self._find_law_by_mode(step.after)
-        described = self._describe_pairs(step, law)
+        pairs_of_modes = self._describe_pairs(step, law)
         merged = step.map_states(_merge_mixture)
         # Of several plants there is no one function by which the whole mixture moves.
         moments: Any = None
@@ -262,8 +270,8 @@ class MultipleModelFilter(AbstractSizedFilter):
             moments = smoother_step_by_transform(self, merged, first(self.plant)).before
         return ModalSmootherStep(
             merged.after, moments, claim=self.claim, manifold=first(self.plant).manifold, law=law,
-            known=described.known, ways=described.ways, weights=described.weights,
-            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), described.pairs),
+            known=pairs_of_modes.known, ways=pairs_of_modes.ways, weights=pairs_of_modes.weights,
+            pairs=jax.tree.map(lambda leaf: leaf.reshape(modes, modes, *leaf.shape[1:]), pairs_of_modes.pairs),
         )  # fmt: skip
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
@@ -295,12 +303,6 @@ def _merge_mixture(state: ModalBeliefs) -> Gaussian:
     """Return one Gaussian with the mean and covariance of the mixture."""
     weights, parts = state.components
     return merge_mixture(parts, weights)
-
-
-def replicate(x: T, count: int) -> T:
-    """Replicate an object `count` times along a new first axis."""
-    copies: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
-    return copies
 
 
 @accept_limits

@@ -23,12 +23,9 @@ from heliograph.filters.gaussian.gaussian_prediction import predict_gaussian, se
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import find_signal_moments
 from heliograph.filters.modes.arrival_patterns import ChannelByPattern
-from heliograph.filters.modes.mixing import align_angles
+from heliograph.filters.modes.mixing import align_angles, replicate
 from heliograph.filters.modes.models_by_mode import fields_of_mode_filters
-from heliograph.filters.modes.multiple_model import (
-    correct_in_every_mode,
-    replicate,
-)
+from heliograph.filters.modes.multiple_model import correct_in_every_mode
 from heliograph.filters.particles.factory import build_partly_drawn
 from heliograph.filters.particles.rao_blackwellised import PartlyDrawnFilter
 from heliograph.filters.particles.resampling import (
@@ -102,11 +99,11 @@ class ParticleFilter(AbstractSizedFilter):
         Particle i of n has the mode at the share (i + 1/2) / n of the distribution. `moved`: whether a step was
         predicted.
         """
-        start, n = at(self.plant, 0), self.particles
-        parts = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
+        start, n = at(self.plant, k=0), self.particles
+        gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
         mode = invert_distribution(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
         return Particles(
-            gaussian=parts,
+            gaussian=gaussians,
             mode=mode,
             weight=jnp.full(n, 1 / n),
             key=jax.random.PRNGKey(self.seed),
@@ -122,13 +119,14 @@ class ParticleFilter(AbstractSizedFilter):
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         key = jax.random.fold_in(state.key, 0)
-        rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
-        drawn = jax.vmap(invert_distribution)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
+        transition = jnp.asarray(at(self.channel, k).transition)[state.mode]
+        uniform = jax.random.uniform(key, state.weight.shape, state.weight.dtype)
+        drawn_mode = jax.vmap(invert_distribution)(transition, uniform)
         start = second_moments_at_start(self.plant)
-        parts = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
-        mode = jnp.where(state.moved, drawn, state.mode)
-        parts = parts._replace(mean=align_angles(plant, parts.mean, state.weight))
-        return Particles(gaussian=parts, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
+        gaussians = jax.vmap(lambda x: predict_gaussian(plant, self.transform, x, u, start))(state.gaussian)
+        mode = jnp.where(state.moved, drawn_mode, state.mode)
+        gaussians = gaussians._replace(mean=align_angles(plant, gaussians.mean, state.weight))
+        return Particles(gaussian=gaussians, mode=mode, weight=state.weight, key=key, moved=jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
@@ -226,6 +224,6 @@ def particle_filter(
         return build_state_particles(plant, sensor, channel, count, seed, proposal, resample)
     return ParticleFilter(
         particles=check_count("particles", FEW if particles is None else particles),
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **fields_of_mode_filters(plant, sensor, channel, transform, nodes),
     )

@@ -73,10 +73,8 @@ class SideInformationBelief(NamedTuple):
     @property
     def errors(self) -> WeightedColumns:
         """E[e e' | side information] as columns (N, M q): e the error of the estimate, q columns of each of M modes."""
-        moments = self.moments
-        return side_by_side(
-            WeightedColumns(moments.matrix[:, : len(self.mean)], moments.weights), np.ones(len(self.lower))
-        )
+        of_errors = WeightedColumns(self.moments.matrix[:, : len(self.mean)], self.moments.weights)
+        return side_by_side(of_errors, np.ones(len(self.lower)))
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
@@ -107,19 +105,18 @@ class SideInformationFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> SideInformationBelief:
-        """Return the prior, independent of the mode."""
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        """Return the prior, in which state and mode are independent; x~ = (x - c, 1), p the law of the modes."""
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
         prior = from_covariance(start.initial_mean, start.initial_covariance)
         unit = np.eye(len(self.states) + 1)[:, -1:]
-        # q in each mode of x - c and of what is known there, x~ = (0, 1) and e = (1{mode} - p) x (0, 1).
+        # Columns of q = (e, x~) in each mode: e, the error of (x~ 1{mode 1}, ...), is 1_j (x) x~ - p (x) (0, 1).
         x = jnp.concatenate([jnp.pad(prior.root, ((0, 1), (0, 0))), unit], axis=1)
         constant = jnp.zeros_like(x).at[:, -1:].set(unit)
-        errors = [kron(of_mode[:, None], x) - kron(law[:, None], constant) for of_mode in jnp.eye(len(law))]
-        moments = WeightedColumns(
-            jnp.stack([jnp.concatenate([e, x]) for e in errors]), outer(law, jnp.append(prior.variances, 1.0))
-        )
-        mean = jnp.kron(law, unit[:, 0])
-        return _make_belief(mean, jax.vmap(triangularise)(moments), jnp.asarray(start.initial_mean), jnp.asarray(False))
+        errors = [kron(indicator[:, None], x) - kron(law[:, None], constant) for indicator in jnp.eye(len(law))]
+        weights = outer(law, jnp.append(prior.variances, 1.0))
+        moments = WeightedColumns(jnp.stack([jnp.concatenate([e, x]) for e in errors]), weights)
+        factors, mean = jax.vmap(triangularise)(moments), jnp.kron(law, unit[:, 0])
+        return _make_belief(mean, factors, centre=jnp.asarray(start.initial_mean), moved=jnp.asarray(False))
 
     @predicts
     def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
@@ -146,8 +143,12 @@ class SideInformationFilter(AbstractSizedFilter):
         noise = noise_in_mode(plant, u, second_moments_at_start(self.plant))
 
         def collect_into(one_j: jax.Array, chances: jax.Array, probability: jax.Array) -> WeightedColumns:
-            """Return E[q+ q+' 1{mode j}], from the chances of i -> j and the probability of j."""
-            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)  # rows: of the chain
+            """Return E[q+ q+' 1{next mode j}], from the indicator 1_j, P(j | i) by mode i (`chances`), and P(j).
+
+            Closed over: `errors`, `x`, columns of e and x~ by mode i, of `weights`; `rows`, the transition matrix of
+            the modes; `noise`, columns of the process noise; `move_columns`, from (e, x~) to (e+, x~+).
+            """
+            moved = WeightedColumns(jax.vmap(move_columns)(one_j - rows, errors, x), weights)
             process = WeightedColumns(kron(jnp.append(one_j, 1.0)[:, None], noise.matrix), probability * noise.weights)
             return triangularise(join_columns(side_by_side(moved, chances), process))
 
@@ -197,8 +198,8 @@ class SideInformationFilter(AbstractSizedFilter):
     def estimate(self, state: SideInformationBelief) -> Estimate:
         """Return x = c + sum_j zeta_j, zeta_j the estimate of (x - c) 1{mode j}, and the covariance of its error."""
         projection = make_mode_sum_matrix(len(self.states), len(self.initial))
-        mean, covariance = state.centre + projection @ state.mean, state.errors.through(projection).covariance
-        return Estimate(mean, covariance, self.claim)
+        covariance = state.errors.through(projection).covariance
+        return Estimate(state.centre + projection @ state.mean, covariance, self.claim)
 
 
 class StackedMeasurementModel(NamedTuple):
@@ -268,12 +269,16 @@ def _make_measurement_model(
     def describe_noise(
         gain: jax.Array, spread: jax.Array, link: WeightedColumns, x: WeightedColumns, p: jax.Array
     ) -> WeightedColumns:
-        """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain."""
-        # measure, noise: y~ = (y, 1) = measure x~ + noise; size: E[x_i^2] at the start, for rounding.
-        sent = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
-        plain = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
+        """Return the noise of z in one mode, of probability p: of sensor and link, rounding, spread of the gain.
+
+        `gain`, `spread`: mean and covariance of (G, n) in z = G y + n; `link`: columns of Cov n; `x`: columns of E[x~
+        x~' 1{mode}], x~ = (x, 1). (y, 1) = measure x~ + noise; `size`: E[x_i^2] at the start, for rounding.
+        """
+        signal_moments = x.through(measure).covariance + p * noise  # E[y~ y~' 1{mode}]
+        known_noise = join_columns(sensor.noise.columns.through(gain[:, :-1]), link).times(p)
         rounding = rounding_of((jnp.abs(gain[:, :-1]) @ square_root(size)) ** 2).times(p)
-        return triangularise(join_columns(plain, rounding, factor_spread(jnp.einsum("mlab,ab->ml", spread, sent))))
+        gain_noise = factor_spread(jnp.einsum("mlab,ab->ml", spread, signal_moments))
+        return triangularise(join_columns(known_noise, rounding, gain_noise))
 
     # Output matrix of zeta less the mean output; modes of probability zero have none.
     output, common = subtract_mean_output(gains @ measure, law)
@@ -388,7 +393,8 @@ def side_information_filter(
 @cache_by_object
 def _describe_channel_by_mode(channel: Channel) -> tuple[Float[Array, " M"], list[ChannelByPattern], bool]:
     """Return the modes' initial probabilities, the channel by mode at each step, and whether all laws are known."""
-    steps = [joint_modes(c) for c in unstack(channel)]
-    # one corner: known probabilities
-    is_known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
-    return steps[0].initial, describe_by_pattern(steps, np.ones((len(steps[0].initial), 1))), is_known
+    steps = [joint_modes(step) for step in unstack(channel)]
+    # Probabilities are known where they have one extreme law (corner).
+    is_known = all(affine.corner_count() == 1 for step in steps for affine in step.maps)
+    no_flag = np.ones((len(steps[0].initial), 1))
+    return steps[0].initial, describe_by_pattern(steps, no_flag), is_known and not uncertain_chain(channel)

@@ -67,13 +67,13 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def init(self) -> UncertainBelief:
         """Return the prior, independent of the mode, whose initial law is known.
 
-        `low`, `high`: ends of the modes' law, equal at the start; `second`: E[x~ x~'], x~ = (x - centre, 1).
+        `low`, `high`: ends of the modes' law, equal at the start; `second_moment`: E[x~ x~'], x~ = (x - centre, 1).
         """
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        prior, second = compute_initial_moments(start, self.initial)
+        start, law = at(self.plant, k=0), jnp.asarray(self.initial)
+        prior, second_moment = compute_initial_moments(start, self.initial)
         centre = jnp.asarray(start.initial_mean)
         return UncertainBelief(
-            gaussian=prior, second=second, centre=centre, law=law, low=law, high=law, moved=jnp.asarray(False)
+            gaussian=prior, second=second_moment, centre=centre, law=law, low=law, high=law, moved=jnp.asarray(False)
         )
 
     @predicts
@@ -81,26 +81,28 @@ class UncertainModalFilter(AbstractJointModalFilter):
         """Propagate the bound on Sigma-; at the first prediction the mode has its initial law.
 
         Sigma-: covariance of zeta = (x~ 1{mode = 1}, x~ 1{mode = 2}, ...), x~ = (x - centre, 1). `young`: scalar of
-        Young's inequality, by which the bound of the nominal part grows; `fresh`: noise and the uncertain part.
+        Young's inequality, by which the bound of the nominal part grows; `added_noise`: noise and the uncertain part.
         """
-        (rows, radius), x = self._chain_and_radius(state, k), state.gaussian
-        move, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
-        root, young, fresh = self._transition_factors(state, u, k)
-        centred, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ rows
-        mean = predict_by_mode(centred[:, None], move, rows)[:, 0] + mean_from_centre(law, centre)
-        after = from_columns(mean, join_columns(WeightedColumns(root, (1 + young) * x.variances), fresh))
+        x = state.gaussian
+        transition, radius = self._chain_and_radius(state, k)
+        matrix, noise, centre = centred_transition(at(self.plant, k), u, state.centre)
+        root, young, added_noise = self._transition_factors(state, u, k)
+        deviation, law = x.mean - mean_from_centre(state.law, state.centre), state.law @ transition
+        mean = predict_by_mode(deviation[:, None], matrix, transition)[:, 0] + mean_from_centre(law, centre)
+        after = from_columns(mean, join_columns(WeightedColumns(root, (1 + young) * x.variances), added_noise))
         # E[x~ x~'] and nominal law one step later.
-        second, (low, high) = move @ state.second @ move.T + noise, _bound_next_law(rows, radius, state.low, state.high)
+        second_moment = matrix @ state.second @ matrix.T + noise
+        low, high = _bound_next_law(transition, radius, state.low, state.high)
         return UncertainBelief(
-            gaussian=after, second=second, centre=centre, law=law, low=low, high=high, moved=jnp.asarray(True)
+            gaussian=after, second=second_moment, centre=centre, law=law, low=low, high=high, moved=jnp.asarray(True)
         )
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
         """Return the modes' transition matrix and the radius of its entries; before the first prediction I and 0."""
         channel = at(self.channel, k)
         # Modes keep their initial law up to the first step.
-        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
-        return rows, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
+        transition = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
+        return transition, jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
 
     def _transition_factors(
         self, state: UncertainBelief, u: ArrayLike, k: Step
@@ -127,30 +129,34 @@ class UncertainModalFilter(AbstractJointModalFilter):
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Correct with z; the covariance of z given zeta is bounded over the laws of the modes.
 
-        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1); `second`: E[y~ y~'] of the signal; `added`: noise and spread
-        of the gains, bounded.
+        zeta = (x~ 1{mode = 1}, ...), x~ = (x - centre, 1); `signal_moment`: E[y~ y~'] of the signal; `bounded_noise`:
+        bound of noise and spread of the gains.
         """
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), centred_measurement(sensor, state.centre)
-        second = measure @ state.second @ measure.T + noise
-        random = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second)
-        added = _bound_mean(random + gains @ noise @ gains.swapaxes(1, 2), *_find_middle_law(state.low, state.high))
-        matrix, common = subtract_mean_output(gains @ measure, state.law)
-        rounding = rounding_of_received(gains, state.law[:, None, None] * second)
-        centred = state.gaussian.mean - mean_from_centre(state.law, state.centre)
-        output = MeasurementModel(concatenate_modes(matrix), common, join_columns(rounding, factor_spread(added)))
-        after, innovation = condition_modes_on_received(state.gaussian, centred, output, z)
+        signal_moment = measure @ state.second @ measure.T + noise
+        gain_noise = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), signal_moment)
+        middle, reach = _find_middle_law(state.low, state.high)
+        bounded_noise = _bound_mean(gain_noise + gains @ noise @ gains.swapaxes(1, 2), middle, reach)
+        matrix, mean_output = subtract_mean_output(gains @ measure, state.law)
+        rounding = rounding_of_received(gains, state.law[:, None, None] * signal_moment)
+        deviation = state.gaussian.mean - mean_from_centre(state.law, state.centre)
+        output = MeasurementModel(
+            concatenate_modes(matrix), mean_output, join_columns(rounding, factor_spread(bounded_noise))
+        )
+        after, innovation = condition_modes_on_received(state.gaussian, deviation, output, z)
         return state._replace(gaussian=after), innovation
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
         """Return the smoother step of zeta+ = F zeta + noise; nominal, as the bound is not proved for smoothing.
 
-        zeta: the state times each mode's indicator; `young`: scalar of the bound, by which its nominal part grows.
+        zeta: the state times each mode's indicator; `young`: scalar of the bound, by which its nominal part grows;
+        `added_noise`: process noise and the uncertain part.
         """
-        slopes, young, fresh = self._transition_factors(step.before, step.u, step.k)
-        noise = triangularise(join_columns(WeightedColumns(slopes, young * step.before.gaussian.variances), fresh))
-        moved, projection = (slopes, noise), self._projection_to_state()
-        return smoother_step_of(step, moved, "nominal", projection=projection)
+        slopes, young, added_noise = self._transition_factors(step.before, step.u, step.k)
+        growth = WeightedColumns(slopes, young * step.before.gaussian.variances)
+        slopes_and_noise = slopes, triangularise(join_columns(growth, added_noise))
+        return smoother_step_of(step, slopes_and_noise, "nominal", projection=self._projection_to_state())
 
 
 def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
@@ -158,21 +164,21 @@ def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
     return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 
-def _bound_moves(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _bound_moves(transition: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return bounds on Cov(1{next} | i) and on Delta_i Delta_i' (M, M, M), for each mode i and every Delta_i.
+
+    pi_i, row i of `transition`: the nominal law of the next mode after i; Delta_i: its error, |Delta_ij| <= r_ij
+    (`radius`).
 
     Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
     the projection that removes the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
-
-    `rows`: pi_i, the nominal law of the next mode after mode i; `radius`: r, by how much each probability may be off
-    (Delta).
     """
-    modes = len(rows)
-    difference = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
-    of_jumps = jnp.einsum("ij,ija,ijb->iab", rows + radius, difference, difference)
-    centring = jnp.eye(modes) - 1 / modes  # P
-    sizes = radius * jnp.sum(radius, axis=1, keepdims=True)
-    return of_jumps, jnp.einsum("aj,ij,jb->iab", centring, sizes, centring)
+    modes = len(transition)
+    difference = jnp.eye(modes)[None] - transition[:, None, :]  # [i, j] = e_j - pi_i
+    jump_covariance = jnp.einsum("ij,ija,ijb->iab", transition + radius, difference, difference)
+    projection = jnp.eye(modes) - 1 / modes
+    delta_bound = radius * jnp.sum(radius, axis=1, keepdims=True)
+    return jump_covariance, jnp.einsum("aj,ij,jb->iab", projection, delta_bound, projection)
 
 
 def _find_middle_law(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -191,39 +197,39 @@ def _bound_mean(matrices: jax.Array, middle: jax.Array, reach: jax.Array) -> jax
     X_i: symmetric matrices, |X| has the absolute eigenvalues of X; `reach`: by how much p_i may differ from middle_i.
     """
     values, vectors = jax.vmap(eigh)(matrices - jnp.mean(matrices, axis=0))
-    sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
-    return jnp.einsum("i,iab->ab", middle, matrices) + jnp.einsum("i,iab->ab", reach, sizes)
+    absolute = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
+    return jnp.einsum("i,iab->ab", middle, matrices) + jnp.einsum("i,iab->ab", reach, absolute)
 
 
 def _bound_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return a bound on diag(p) for all laws p, tight in the direction of x, which is that of equal entries.
+    """Return a bound on diag(p) over all laws p of the modes, tight in the direction of equal entries.
 
-    delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
-    diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
-    P diag(delta) P is 0 for two modes.
-
-    `low`, `high` (M,): ends of each mode's probability p; `middle`: a law between them, `reach`: the most that p
-    differs.
+    p = middle + delta, |delta_i| <= reach_i, delta summing to 0. With u = (1, ..., 1) / root M, P = I - u u' and d =
+    delta / root M: diag(delta) = P diag(delta) P + u d' + d u', and u d' + d u' <= e u u' + d d' / e by Young's
+    inequality. P diag(delta) P is 0 for two modes. `low`, `high` (M,): ends of each mode's probability.
     """
-    modes, (middle, reach) = len(low), _find_middle_law(low, high)
-    centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
-    share = total / modes / 2  # e; d d' <= diag(reach) sum reach / M, by Cauchy and Schwarz
-    safe = jnp.where(share > 0, share, 1.0)
-    across = centred @ jnp.diag(reach * total) @ centred / (safe * modes)
-    within = centred @ jnp.diag(reach) @ centred if modes > 2 else jnp.zeros((modes, modes))
-    return jnp.diag(middle) + share / modes * jnp.ones((modes, modes)) + across + within
+    modes = len(low)
+    middle, reach = _find_middle_law(low, high)
+    projection, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
+    e = total / modes / 2  # d d' <= diag(reach) sum reach / M, by Cauchy and Schwarz
+    safe_e = jnp.where(e > 0, e, 1.0)
+    cross_term = projection @ jnp.diag(reach * total) @ projection / (safe_e * modes)
+    projected = projection @ jnp.diag(reach) @ projection if modes > 2 else jnp.zeros((modes, modes))
+    return jnp.diag(middle) + e / modes * jnp.ones((modes, modes)) + cross_term + projected
 
 
-def _bound_next_law(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _bound_next_law(
+    transition: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Return the least and the greatest probability of every mode one step later, over laws between low and high.
 
-    `rows`: nominal transition matrix; `radius`: by how much each entry may be off; `low`, `high`: ends of the present
-    law.
+    `transition`: nominal transition matrix; `radius`: by how much each entry may be off; `low`, `high`: ends of the
+    present law.
     """
-    least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
+    lowest, highest = jnp.clip(transition - radius, 0.0, 1.0), jnp.clip(transition + radius, 0.0, 1.0)
     largest_by_mode = jax.vmap(_largest_payoff, (1, None, None))
     # The least value is minus the largest one of the negative.
-    return -largest_by_mode(-least, low, high), largest_by_mode(most, low, high)
+    return -largest_by_mode(-lowest, low, high), largest_by_mode(highest, low, high)
 
 
 def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
@@ -231,11 +237,11 @@ def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.A
 
     `payoff`, `low`, `high` (M,): what each mode is worth, and the ends of its probability p.
     """
-    # earlier[i, j]: i is served before j, by payoff and then by number.
+    # [i, j]: mode i gets its mass before mode j, by payoff and then by number.
     number = jnp.arange(len(payoff))
-    earlier = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
-    room = high - low
-    added = jnp.clip(1 - jnp.sum(low) - room @ earlier, 0.0, room)
+    is_served_before = (payoff[:, None] > payoff) | ((payoff[:, None] == payoff) & (number[:, None] < number))
+    capacity = high - low
+    added = jnp.clip(1 - jnp.sum(low) - capacity @ is_served_before, 0.0, capacity)
     return (low + added) @ payoff
 
 

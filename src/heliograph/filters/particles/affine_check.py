@@ -34,26 +34,26 @@ class _EntryDegrees(NamedTuple):
 
 
 @in_float64
-def is_affine(function: Callable[..., jax.Array], x: np.ndarray, places: Sequence[int], *rest: np.ndarray) -> bool:
-    """Return whether f(x, *rest) is seen to be affine in the entries of x at these places, whatever all others are.
+def is_affine(function: Callable[..., jax.Array], x: np.ndarray, indices: Sequence[int], *others: np.ndarray) -> bool:
+    """Return whether f(x, *others) is seen to be affine in the entries of x at these indices, whatever all others are.
 
-    Each entry has a degree: KNOWN, GIVEN (no dependence on those places), AFFINE in them, or OTHER; they are passed on
-    operation by operation.
+    Each entry has a degree: KNOWN, GIVEN (no dependence on those entries), AFFINE in them, or OTHER; they are passed
+    on operation by operation.
 
     Args:
         function: f, in operations of jax.numpy.
         x: a point (n,), by its shape.
-        places: of x, in which f is to be affine.
-        rest: further arguments, by their shapes.
+        indices: of the entries of x in which f is to be affine.
+        others: further arguments, by their shapes.
     """
-    program = jax.make_jaxpr(function)(x, *rest)
+    program = jax.make_jaxpr(function)(x, *others)
     degree = np.full(x.shape, GIVEN)
-    degree[list(places)] = AFFINE
-    arguments = [_EntryDegrees(degree), *(_EntryDegrees(np.full(np.shape(argument), GIVEN)) for argument in rest)]
-    return all(np.all(result.degree <= AFFINE) for result in _trace_degrees(program, arguments))
+    degree[list(indices)] = AFFINE
+    arguments = [_EntryDegrees(degree), *(_EntryDegrees(np.full(np.shape(argument), GIVEN)) for argument in others)]
+    return all(np.all(result.degree <= AFFINE) for result in _classify_dependence(program, arguments))
 
 
-def _trace_degrees(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
+def _classify_dependence(program: core.ClosedJaxpr, arguments: Sequence[_EntryDegrees]) -> list[_EntryDegrees]:
     """Return the degrees of a program's results, operation by operation.
 
     A degree says how an entry depends on the arguments: known, given, affine, or otherwise.
@@ -89,7 +89,7 @@ def _degrees_of_operation(equation: Any, x: list[_EntryDegrees]) -> list[_EntryD
         return list(results) if equation.primitive.multiple_results else [results]
 
     if (called := called_program(equation)) is not None:
-        return _trace_degrees(called, x)
+        return _classify_dependence(called, x)
     # Known operands give known results, given ones given results.
     if all(operand.value is not None for operand in x):
         return [_trace_known_array(value) for value in compute([operand.value for operand in x])]
@@ -153,7 +153,7 @@ def _degree_of_contraction(a: _EntryDegrees, b: _EntryDegrees, dimensions: Any) 
         """Return for each sum how many of its products have both of these properties."""
         return np.asarray(jax.lax.dot_general(of_a.astype(float), of_b.astype(float), dimensions))
 
-    affine = count(a.degree >= AFFINE, ~b.is_zero) + count(~a.is_zero, b.degree >= AFFINE)
-    other = count(a.degree >= OTHER, ~b.is_zero) + count(~a.is_zero, b.degree >= OTHER)
-    both = count(a.degree >= AFFINE, b.degree >= AFFINE)
-    return np.where(other + both > 0, OTHER, np.where(affine > 0, AFFINE, GIVEN))
+    affine_terms = count(a.degree >= AFFINE, ~b.is_zero) + count(~a.is_zero, b.degree >= AFFINE)
+    other_terms = count(a.degree >= OTHER, ~b.is_zero) + count(~a.is_zero, b.degree >= OTHER)
+    both_affine = count(a.degree >= AFFINE, b.degree >= AFFINE)
+    return np.where(other_terms + both_affine > 0, OTHER, np.where(affine_terms > 0, AFFINE, GIVEN))

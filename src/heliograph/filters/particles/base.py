@@ -119,10 +119,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         `predicted`: what each particle expects of z; `density`: log p(z). Sums are about the heaviest particle's
         expectation, so that large numbers keep their digits.
         """
-        number = find_reference_particle(weight, predicted)
-        reference = tuple(part[number] for part in predicted)
-        received = self.sum_received(reference, weight, predicted, z, k)
-        return self.innovation_from_sums(received, reference, z, k, density)
+        heaviest = find_reference_particle(weight, predicted)
+        reference = tuple(expectations[heaviest] for expectations in predicted)
+        sums = self.sum_received(reference, weight, predicted, z, k)
+        return self.innovation_from_sums(sums, reference, z, k, density)
 
     @property
     def of_atoms(self) -> bool:
@@ -136,10 +136,10 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         unchanged.
         """
         weight = jax.nn.softmax(log_weight)
-        too_few = effective_number(weight) < jnp.asarray(self.resample) * self.particles
+        resamples = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
-        which = jax.lax.cond(too_few, resample_systematically, lambda *_: all_particles, weight, start)
-        return ResampledParticles(which, jnp.where(too_few, 0.0, log_weight))
+        chosen = jax.lax.cond(resamples, resample_systematically, lambda *_: all_particles, weight, start)
+        return ResampledParticles(chosen, jnp.where(resamples, 0.0, log_weight))
 
 
 def update_if_used(used: jax.Array, updated: State, before: State) -> State:

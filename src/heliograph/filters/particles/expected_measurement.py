@@ -40,11 +40,12 @@ class ExpectedMeasurement(NamedTuple):
             weight: weights (B,) of particles before z is known, of any sum.
             predicted: their h(x), (B, p); where it is no number they do not count, unless none does.
         """
-        valid, known = jnp.all(jnp.isfinite(predicted), axis=1), jnp.all(jnp.isfinite(self.reference))
-        both = jnp.where(valid | ~known, weight, 0.0)[:, None] * jnp.asarray(self.atoms.weight)
-        value = self.z - jax.vmap(self.atoms.expected)(jnp.where(valid[:, None], predicted, 0.0))
-        apart = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
-        return both.ravel(), apart.reshape(-1, len(self.z))
+        is_finite = jnp.all(jnp.isfinite(predicted), axis=1)
+        some_is_finite = jnp.all(jnp.isfinite(self.reference))  # else the reference would be a finite one
+        joint_weight = jnp.where(is_finite | ~some_is_finite, weight, 0.0)[:, None] * jnp.asarray(self.atoms.weight)
+        value = self.z - jax.vmap(self.atoms.expected)(jnp.where(is_finite[:, None], predicted, 0.0))
+        difference = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
+        return joint_weight.ravel(), difference.reshape(-1, len(self.z))
 
     def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
         """Return mean and covariance of the innovation, and log p(z).
@@ -57,11 +58,11 @@ class ExpectedMeasurement(NamedTuple):
             density: log p(z), where something arrived.
         """
         mean, present = first.mean(()), ~jnp.isnan(self.z)
-        within = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
-        within = jnp.where(present[:, None] & present, within, jnp.nan)
+        noise = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
+        noise = jnp.where(present[:, None] & present, noise, jnp.nan)
         spread = second / first.weight - jnp.outer(mean, mean)
-        nothing = ~jnp.any(present)  # of nothing the density is 1, to rounding
-        return Innovation(self.base + mean, within + spread, jnp.where(nothing, 0.0, density))
+        nothing_arrived = ~jnp.any(present)  # of nothing the density is 1, to rounding
+        return Innovation(self.base + mean, noise + spread, jnp.where(nothing_arrived, 0.0, density))
 
 
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
@@ -70,7 +71,9 @@ def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Arra
     `predicted`: what particles expect of z, in several arrays; they are numbers if all are finite.
     """
     xp = library(weight, predicted)
-    finite = [xp.all(xp.isfinite(xp.reshape(part, (len(part), -1))), axis=1) for part in predicted]
-    counts = functools.reduce(xp.logical_and, finite) & (weight > 0)
-    number: Array = xp.argmax(xp.where(counts | ~xp.any(counts), weight, 0.0))
-    return number
+    finite_by_array = [
+        xp.all(xp.isfinite(xp.reshape(expectations, (len(expectations), -1))), axis=1) for expectations in predicted
+    ]
+    is_candidate = functools.reduce(xp.logical_and, finite_by_array) & (weight > 0)
+    heaviest: Array = xp.argmax(xp.where(is_candidate | ~xp.any(is_candidate), weight, 0.0))
+    return heaviest

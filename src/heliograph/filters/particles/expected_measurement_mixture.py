@@ -67,7 +67,8 @@ def compute_mixture_innovation(sums: ReceivedSums, base: jax.Array, z: jax.Array
     present = ~jnp.isnan(z)
     weight = jnp.where(sums.weight > 0, sums.weight, 1.0)
     mean = jnp.asarray(sums.value) / weight
-    covariance = jnp.where(present[:, None] & present, sums.spread / weight - jnp.outer(mean, mean), jnp.nan)
-    given_arrivals = density - jnp.log(jnp.asarray(sums.chance) / sums.of_all)
-    nothing = ~jnp.any(present)  # of nothing the density is 1, to rounding
-    return Innovation(base + mean, covariance, jnp.where(nothing, 0.0, given_arrivals))
+    covariance = sums.spread / weight - jnp.outer(mean, mean)
+    covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
+    log_likelihood = density - jnp.log(jnp.asarray(sums.chance) / sums.of_all)
+    nothing_arrived = ~jnp.any(present)  # of nothing the density is 1, to rounding
+    return Innovation(base + mean, covariance, jnp.where(nothing_arrived, 0.0, log_likelihood))

@@ -68,7 +68,7 @@ def build_partly_drawn(
         density=vary_over_steps(densities, sensor, channel),
         initial=joint.initial,
         transition=joint.transition,
-        resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
+        resample=np.asarray(scalar("resample", resample, low=0.0, high=1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         plant_modes=find_models("plant", plant, [model for model, _ in joint.beside]),
         sensor_modes=sensor_modes,
@@ -76,7 +76,7 @@ def build_partly_drawn(
         drawn=len(drawn_places),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **make_sizes("nominal", start, first(channel).outputs),
     )
 
@@ -85,10 +85,10 @@ def _find_places_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) -> 
     """Return the indices of the drawn states, in the plant's order; of all states for None."""
     if drawn is None:
         return tuple(range(len(start.states)))
-    asked = [str(name) for name in items("drawn", drawn, "names of states")]
-    if not set(asked) <= set(start.states) or len(set(asked)) < len(asked):
-        raise fail("drawn", f"some of {list(start.states)}, each once", asked)
-    return tuple(i for i, name in enumerate(start.states) if name in asked)
+    wanted = [str(name) for name in items("drawn", drawn, "names of states")]
+    if not set(wanted) <= set(start.states) or len(set(wanted)) < len(wanted):
+        raise fail("drawn", f"some of {list(start.states)}, each once", wanted)
+    return tuple(i for i, name in enumerate(start.states) if name in wanted)
 
 
 def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:

@@ -61,28 +61,28 @@ def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
 
 
 def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
-    """Return the first sums of particles (B,) and modes, and of the weights of modes.
+    """Return the first sums of particles (B,) and modes, and of the weights of modes, None of one mode.
 
-    The mean direction is that of E exp(i angle), and an angle's Gaussian has exp(i m - variance / 2).
-
-    Each particle has a Gaussian in each mode (M); first sums are of weights, their squares, means, and angles' sine and
-    cosine. No modes are returned where there is one.
+    Each particle has a Gaussian in each of M modes; first sums are of weights, their squares, means, and angles' sine
+    and cosine. The mean direction is that of E exp(i angle), which for a Gaussian angle is exp(i m - variance / 2).
     """
-    share, mean = _list_parts(weight, particles)
+    weights, mean = _list_parts(weight, particles)
     variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)
-    size, angle = share[:, None] * jnp.exp(-variances[:, list(angles)] / 2), mean[:, list(angles)]
-    around = jnp.sum(size * jnp.sin(angle), axis=0), jnp.sum(size * jnp.cos(angle), axis=0)
-    sums = FirstSums(jnp.sum(weight), jnp.sum(weight**2), share @ mean, *around)
+    angle = mean[:, list(angles)]
+    length = weights[:, None] * jnp.exp(-variances[:, list(angles)] / 2)
+    sines_and_cosines = jnp.sum(length * jnp.sin(angle), axis=0), jnp.sum(length * jnp.cos(angle), axis=0)
+    sums = FirstSums(jnp.sum(weight), jnp.sum(weight**2), weights @ mean, *sines_and_cosines)
     modes = particles.log_mode.shape[1]
-    return StateSums(sums, jnp.sum(share.reshape(-1, modes), axis=0) if modes > 1 else None)
+    return StateSums(sums, jnp.sum(weights.reshape(-1, modes), axis=0) if modes > 1 else None)
 
 
 def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
     """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
-    share, mean = _list_parts(weight, particles)
-    apart = wrap_angles(mean - sums.first.mean(angles), angles)
-    within = particles.gaussian.covariance.reshape(len(share), *2 * mean.shape[1:])  # beside the spread of the means
-    return second_sums(share, apart) + jnp.einsum("a,aij->ij", share, within)
+    weights, mean = _list_parts(weight, particles)
+    deviation = wrap_angles(mean - sums.first.mean(angles), angles)
+    n = mean.shape[1]
+    covariances = particles.gaussian.covariance.reshape(len(weights), n, n)
+    return second_sums(weights, deviation) + jnp.einsum("a,aij->ij", weights, covariances)
 
 
 def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Array]:
@@ -91,5 +91,5 @@ def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Arr
     A particle has M modes, each with a Gaussian of n states and a log probability.
     """
     x, log_mode = particles
-    share = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()
-    return share, jnp.asarray(x.mean).reshape(len(share), -1)
+    weights = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()
+    return weights, jnp.asarray(x.mean).reshape(len(weights), -1)

@@ -40,13 +40,13 @@ def condition_on_draw(x: Gaussian, draw: jax.Array) -> Gaussian:
 
 
 def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
-    """Return which of the leading states d, given those before them, have no variance but rounding's (drawn,).
+    """Return which of the leading states d (drawn,), given those before them, have no variance but rounding's.
 
-    `second`: bound of E[d^2], of which rounding is a share.
+    `second_moment`: bound of E[d^2], of which rounding is a share.
     """
     drawn = len(d)
-    second = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
-    return x.variances[:drawn] <= rounding_of_products(drawn, second)
+    second_moment = x.root[:drawn, :drawn] ** 2 @ x.variances[:drawn] + d**2
+    return x.variances[:drawn] <= rounding_of_products(drawn, second_moment)
 
 
 def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
@@ -57,7 +57,8 @@ def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
     variances = jnp.where(certain, 1.0, x.variances[:drawn])
-    log_density = jnp.where(certain, 0.0, -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2)
+    log_density = -(xi**2 / variances + jnp.log(variances) + LOG_TURN) / 2
+    log_density = jnp.where(certain, 0.0, log_density)
     mean = (x.mean + x.root[:, :drawn] @ xi).at[:drawn].set(d)
     given = x._replace(mean=mean, variances=x.variances.at[:drawn].set(0.0))
     return given, jnp.sum(log_density)

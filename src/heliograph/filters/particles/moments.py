@@ -1,11 +1,15 @@
 """Weighted moments of particles, in two passes of sums over them: a part of the particles has a part of each sum."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.numerics.angle import Angles
+from heliograph.numerics.types import Array, PyTree
 
 
 class FirstSums(NamedTuple):
@@ -18,11 +22,10 @@ class FirstSums(NamedTuple):
     cosine: jax.Array
 
     def mean(self, angles: Angles) -> jax.Array:
-        """Return the weighted mean (n,), of an angle the mean direction."""
+        """Return the weighted mean (n,), of an angle the mean direction, that of the sums of sine and cosine."""
         mean = jnp.asarray(self.value) / self.weight
-        for place, i in enumerate(angles):
-            # of weighted sums of sine and cosine
-            mean = mean.at[i].set(jnp.arctan2(self.sine[place], self.cosine[place]))
+        for i, sine, cosine in zip(angles, self.sine, self.cosine, strict=True):
+            mean = mean.at[i].set(jnp.arctan2(sine, cosine))
         return mean
 
 
@@ -38,11 +41,28 @@ def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
 
     They are of the weights, their squares and x, and of sine and cosine of the components that are angles.
     """
-    of_angles = x[:, list(angles)]
-    square, around = jnp.sum(weight**2), (weight @ jnp.sin(of_angles), weight @ jnp.cos(of_angles))
-    return FirstSums(jnp.sum(weight), square, weight @ x, *around)
+    angle_columns = x[:, list(angles)]
+    sum_of_squares = jnp.sum(weight**2)
+    sine, cosine = weight @ jnp.sin(angle_columns), weight @ jnp.cos(angle_columns)
+    return FirstSums(jnp.sum(weight), sum_of_squares, weight @ x, sine, cosine)
 
 
 def second_sums(weight: jax.Array, apart: jax.Array) -> jax.Array:
     """Return the sum of w d d' (n, n) of differences d (N, n) from one place, by weights (N,)."""
     return (apart * weight[:, None]).T @ apart
+
+
+def pack_sums(sums: PyTree) -> jax.Array:
+    """Return sums as one vector."""
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
+
+
+def unpack_sums(vector: Array, function: Callable[..., PyTree], *arguments: Any) -> Any:
+    """Return the sums that `pack_sums` joined in one vector, with the tree and shapes of function(*arguments).
+
+    The function is not computed: its result is known by its shapes alone.
+    """
+    leaves, structure = jax.tree.flatten(jax.eval_shape(function, *arguments))
+    ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
+    pieces = jnp.split(jnp.asarray(vector), ends)
+    return jax.tree.unflatten(structure, [x.reshape(leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)])

@@ -16,6 +16,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.chunks import ScanResult
 from heliograph.filters.particles.expected_measurement import find_reference_particle
+from heliograph.filters.particles.moments import pack_sums, unpack_sums
 from heliograph.filters.particles.resampling import resample_concrete_weights
 from heliograph.numerics.float64 import quickly_compiled
 from heliograph.numerics.types import Array, PyTree
@@ -45,7 +46,7 @@ class ParticleGroup(NamedTuple):
 
 
 class ParticleSums(NamedTuple):
-    """Sums over the particles of a row: of states and of what is received as `_pack_sums` makes them, `second` (n, n).
+    """Sums over the particles of a row: of states and of what is received as `pack_sums` makes them, `second` (n, n).
 
     `reference` is what the particle expects from which innovations are counted, `density` log p(z | earlier rows).
     """
@@ -60,7 +61,7 @@ class ParticleSums(NamedTuple):
 def filter_particles(
     filter: Any, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0
 ) -> ScanResult | None:
-    """Filter rows with particles in lanes; None of no rows, or without native code.
+    """Filter rows with particles as the lanes of native code; None if there are no rows, or no native code.
 
     Args:
         filter: the filter.
@@ -75,7 +76,7 @@ def filter_particles(
     if not len(z):
         return None
     with jax.enable_x64(True):
-        return _filter_rows(filter, np.asarray(z), np.asarray(u), state, int(begin))
+        return _filter_rows(filter, np.asarray(z), np.asarray(u), state, begin=int(begin))
 
 
 class _RowArrays(NamedTuple):
@@ -161,22 +162,26 @@ def _compile_programs(
 
 
 def _compile_in_place(
-    function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...], runs: int
+    function: Call, filter: Any, arguments: tuple[Any, ...], differs_by_run: tuple[bool, ...], runs: int
 ) -> Any:
     """Return a call of function(filter, *arguments), `runs` times, that reads these arrays in place.
 
-    `differs` says which arguments have an entry for each run. None without native code.
+    `differs_by_run`: which arguments have an entry for each run. None without native code.
     """
-    code = _compile_call(function, filter, arguments, differs)
-    return None if code is None else code.make_in_place_code(runs, dict(enumerate(jax.tree.leaves(arguments))))
+    code = _compile_call(function, filter, arguments, differs_by_run)
+    if code is None:
+        return None
+    arrays_by_number = dict(enumerate(jax.tree.leaves(arguments)))
+    return code.make_in_place_code(runs, arrays_by_number)
 
 
-def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs: tuple[bool, ...]) -> Any:
+def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], differs_by_run: tuple[bool, ...]) -> Any:
     """Return the compiled function(filter, *arguments), to be called with the arguments; None without native code."""
-    choice = choose_code(function, (filter, *arguments), [False, *differs])
+    choice = choose_code(function, (filter, *arguments), differs_by_run=[False, *differs_by_run])
     if choice.code is None:
         return None
-    return choice.code.with_first_arguments(*choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))])
+    arrays_of_filter = choice.arrays[: len(choice.arrays) - len(jax.tree.leaves(arguments))]
+    return choice.code.with_first_arguments(*arrays_of_filter)
 
 
 def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
@@ -190,58 +195,50 @@ def _take_first(tree: PyTree) -> PyTree:
 
 
 def _advance_particle(
-    filter: Any, row: DataRow, used: Array, particle: PyTree, log_weight: Array, number: Array
+    filter: Any, row: DataRow, is_used: Array, particle: PyTree, log_weight: Array, number: Array
 ) -> tuple[PyTree, jax.Array, tuple[jax.Array, ...]]:
-    """Move a particle and weigh it by z where the row is used; return it, its log weight, and what it expected."""
+    """Move a particle and weigh it by z if the row `is_used`; return it, its log weight, and what it expected of z.
+
+    `number`: of the particle, of which its random numbers depend. The filter's methods take arrays of particles, here
+    of one.
+    """
     numbers = jnp.asarray(number)[None]
-    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
-    moved, law = filter.move_particles(one, numbers, row.noise_key, row.u, row.k, row.moved)
-    weighed = filter.weigh_particles(moved, law, numbers, row.proposal_key, row.z, row.k)
-    likelihood = jnp.where(used, weighed.log_likelihood[0], 0.0)
-    after = jax.tree.map(lambda new, old: jnp.where(used, new, old), weighed.particles, moved)
+    one_particle = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], particle)
+    moved_particle, law = filter.move_particles(one_particle, numbers, row.noise_key, row.u, row.k, row.moved)
+    weighed = filter.weigh_particles(moved_particle, law, numbers, row.proposal_key, row.z, row.k)
+    likelihood = jnp.where(is_used, weighed.log_likelihood[0], 0.0)
+    after = jax.tree.map(lambda new, old: jnp.where(is_used, new, old), weighed.particles, moved_particle)
     return _take_first(after), jnp.asarray(log_weight) + likelihood, _take_first(weighed.predicted)
 
 
 def _sum_for_mean(
     filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the first sums of the states of a group of particles, and the sums of what they expect of z."""
+    """Return, as a vector each, the first sums of a group's states, and the sums of what its particles expect of z."""
     group = jax.tree.map(jnp.asarray, group)
+    states = filter.sum_for_mean(group.weight, group.particles)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
-    return _pack_sums(filter.sum_for_mean(group.weight, group.particles)), _pack_sums(received)  # as one vector each
+    return pack_sums(states), pack_sums(received)
 
 
 def _sum_for_covariance(filter: Any, states: Array, weight: Array, particles: PyTree) -> jax.Array:
     """Return second sums of a group's states about the means of all particles, of which `states` has the sums."""
     weight, particles = jax.tree.map(jnp.asarray, (weight, particles))
-    sums = _unpack_sums(states, filter.sum_for_mean, weight, particles)
+    sums = unpack_sums(states, filter.sum_for_mean, weight, particles)
     second: jax.Array = filter.sum_for_covariance(weight, particles, sums)
     return second
 
 
 def _make_outputs_of_row(filter: Any, row: DataRow, sums: ParticleSums) -> tuple[Any, ...]:
     """Return mean, covariance, innovation, law of modes and effective number of a row, from sums over its particles."""
-    one, weight = jax.tree.map(jnp.asarray, filter.allocate_particles(1)), jnp.ones(1)
-    states = _unpack_sums(sums.states, filter.sum_for_mean, weight, one)
+    one_particle, weight = jax.tree.map(jnp.asarray, filter.allocate_particles(1)), jnp.ones(1)
+    states = unpack_sums(sums.states, filter.sum_for_mean, weight, one_particle)
     predicted = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], sums.reference)
-    received = _unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
+    received = unpack_sums(sums.received, filter.sum_received, sums.reference, weight, predicted, row.z, row.k)
     estimate = filter.estimate_from_sums(states, sums.second)
     innovation = filter.innovation_from_sums(received, sums.reference, row.z, row.k, sums.density)
     count = states.first.weight**2 / states.first.square
     return estimate.mean, estimate.covariance, innovation, estimate.modes, count
-
-
-def _pack_sums(sums: PyTree) -> jax.Array:
-    """Return sums as one vector."""
-    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
-
-
-def _unpack_sums(vector: Array, function: Call, *arguments: Any) -> Any:
-    """Return the sums that `_pack_sums` joined in one vector, in the form of a function's of these arguments."""
-    leaves, form = jax.tree.flatten(jax.eval_shape(function, *arguments))
-    ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])[:-1].tolist()
-    parts = zip(jnp.split(jnp.asarray(vector), ends), leaves, strict=True)
-    return jax.tree.unflatten(form, [part.reshape(leaf.shape) for part, leaf in parts])
 
 
 def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None, begin: int) -> ScanResult | None:
@@ -277,7 +274,7 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
         for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
     ]
     sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
-    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), [False, True, True])
+    outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), differs_by_run=[False, True, True])
     if outputs.code is None:
         return None
     return ScanResult(loop.last_state(last_key), outputs.results())
@@ -302,11 +299,11 @@ def _draw_keys(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...
         key, proposal_key = filter.keys_of_correction(key, row)
         return key, (jax.random.uniform(choice_key, (), float), noise_key, proposal_key)
 
-    first, start_key = filter.start_keys()
-    last, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
-        draw, first if key is None else jnp.asarray(key), jnp.asarray(z)
+    first_key, start_key = filter.start_keys()
+    last_key, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
+        draw, first_key if key is None else jnp.asarray(key), jnp.asarray(z)
     )
-    return start_key, choice_starts, last, noise_keys, proposal_keys
+    return start_key, choice_starts, last_key, noise_keys, proposal_keys
 
 
 _draw_keys_by_xla = quickly_compiled(_draw_keys)
@@ -316,7 +313,7 @@ class _ParticleLoop:
     """Particles that are moved and weighed row by row, and sums of them that the next row needs."""
 
     def __init__(self, filter: Any, programs: _ParticlePrograms):
-        """Keep the compiled programs, the memory in which they read and write, and how many particles count."""
+        """Keep the filter, its compiled programs, the memory that they read and write, and the number of particles."""
         self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
         self.resample, self.sum, self.square = float(filter.resample), 0.0, 0.0
         self.now, self.log_weight, self.predicted = programs.now, programs.log_weight, programs.predicted
@@ -326,8 +323,8 @@ class _ParticleLoop:
     def set_particles(self, particles: PyTree, log_weight: np.ndarray) -> None:
         """Set the particles (N, ...) before the next row, and their log weights, the largest 0."""
         memory, count = self.memory, self.count
-        for held, new in zip(self.held, jax.tree.leaves(particles), strict=True):
-            held[:count], held[count:] = new, new[0]  # copies of one fill the lanes up
+        for array, values in zip(self.held, jax.tree.leaves(particles), strict=True):
+            array[:count], array[count:] = values, values[0]  # copies of one particle fill the last lanes
         memory.log_weight[:count], memory.log_weight[count:] = log_weight, -np.inf
         np.exp(memory.log_weight, out=memory.weight)
         self.sum, self.square = float(memory.weight.sum()), float(memory.weight @ memory.weight)
@@ -367,32 +364,34 @@ class _ParticleLoop:
     def _choose_particles(self, start: float) -> None:
         """Let particles go on as they are, or resampled where the effective number is too small."""
         memory, count = self.memory, self.count
-        if not self.sum**2 / self.square < self.resample * count:
-            for held, new in self.pairs:
-                new[...] = held
+        effective_number = self.sum**2 / self.square
+        if not effective_number < self.resample * count:
+            for array, next_array in self.pairs:
+                next_array[...] = array
             memory.prior[...] = memory.weight  # weights before z
             return
-        which = resample_concrete_weights(memory.weight[:count], start)
-        for held, new in self.pairs:
-            np.take(held, which, axis=0, out=new[:count], mode="clip")
+        chosen = resample_concrete_weights(memory.weight[:count], start)
+        for array, next_array in self.pairs:
+            np.take(array, chosen, axis=0, out=next_array[:count], mode="clip")
         memory.log_weight[:count], memory.prior[:count], self.sum = 0.0, 1.0, float(count)
 
-    def _advance(self, used: bool) -> float:
-        """Move particles, and weigh them by z if the row is used; return the largest log weight."""
-        self.memory.used[...] = used
+    def _advance(self, is_used: bool) -> float:
+        """Move all particles, and weigh them by z if the row is used; return the largest log weight."""
+        self.memory.used[...] = is_used
         self.programs.advance()
-        for held in (*self.held, *self.predicted):
-            held[self.count :] = held[0]  # fills the lanes up
+        for array in (*self.held, *self.predicted):
+            array[self.count :] = array[0]  # copies of one particle fill the last lanes
         return float(self.log_weight.max())
 
     def _find_reference(self) -> None:
         """Keep what the heaviest particle before z expects: sums of innovations are taken about it."""
         prior: Any = self.memory.prior
-        best: Any = np.argmax(prior)
-        if not all(np.isfinite(part[best]).all() for part in self.predicted):
-            best = find_reference_particle(prior[: self.count], tuple(part[: self.count] for part in self.predicted))
-        for held, new in zip(self.memory.reference, self.predicted, strict=True):
-            held[...] = new[best]
+        heaviest: Any = np.argmax(prior)
+        if not all(np.isfinite(array_of_expectations[heaviest]).all() for array_of_expectations in self.predicted):
+            predicted = tuple(array_of_expectations[: self.count] for array_of_expectations in self.predicted)
+            heaviest = find_reference_particle(prior[: self.count], predicted)
+        for array, expectations_of_all in zip(self.memory.reference, self.predicted, strict=True):
+            array[...] = expectations_of_all[heaviest]
 
     def last_state(self, key: np.ndarray) -> Any:
         """Return the state of the filter after the last row, given the key of what follows."""

@@ -89,15 +89,15 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     @compile_on_call
     def init(self) -> PartlyDrawn:
         """Return the law of x_0 in every particle; its drawn states are drawn unless a linear plant moves them."""
-        key, own = self.start_keys()
-        particles = self.draw_start(own, jnp.arange(self.particles))
+        key, start_key = self.start_keys()
+        particles = self.draw_start(start_key, jnp.arange(self.particles))
         return self.make_state(particles, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def allocate_particles(self, count: int) -> Any:
         """Return arrays of so many particles, to be filled: in each mode mean, factors and log probability."""
         modes, n = len(self.initial), len(self.order)
-        each: Any = (np.zeros((count, modes, *size)) for size in ((n,), (n * (n - 1) // 2,), (n,), ()))
-        mean, lower, variances, log_mode = each
+        arrays: Any = [np.zeros((count, modes, *shape)) for shape in ((n,), (n * (n - 1) // 2,), (n,), ())]
+        mean, lower, variances, log_mode = arrays
         return Cloud(Gaussian(mean, lower, variances), log_mode)
 
     def get_particles(self, state: PartlyDrawn) -> Cloud:
@@ -115,10 +115,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
         """Return the law of x_0 for the particles of these numbers (B,), drawn states first, in every mode."""
-        start, count, order = list_mode_models(at(self.plant, 0))[0], len(numbers), np.array(self.order)
-        x = from_covariance(start.initial_mean[order], start.initial_covariance[order][:, order])
-        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
-        if not self._is_linear(list_mode_models(at(self.plant, 0))):
+        plants, count, order = list_mode_models(at(self.plant, k=0)), len(numbers), np.array(self.order)
+        prior = from_covariance(plants[0].initial_mean[order], plants[0].initial_covariance[order][:, order])
+        x = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), prior)
+        if not self._is_linear(plants):
             x = self._draw_states(x, key, numbers)
         log_mode = jnp.tile(jnp.log(jnp.asarray(self.initial)), (count, 1))
         return Cloud(repeat_for_modes(x, len(self.initial)), log_mode)
@@ -126,11 +126,12 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     @predicts
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
         """Resample where the effective number is too small, then move each particle's Gaussian by every mode's law."""
-        key, choice, own = self.keys_of_prediction(state.key)
-        which, log_weight = self.choose_particles(state.log_weight, choice)
-        particles = jax.tree.map(lambda leaf: leaf[which], self.get_particles(state))
-        moved, _ = self.move_particles(particles, None, own, jnp.asarray(u), k, state.moved)
-        return self.make_state(moved, log_weight, key)
+        key, choice_key, noise_key = self.keys_of_prediction(state.key)
+        chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
+        particles = jax.tree.map(lambda leaf: leaf[chosen], self.get_particles(state))
+        all_numbers, u = None, jnp.asarray(u)
+        moved_particles, _ = self.move_particles(particles, all_numbers, noise_key, u, k, state.moved)
+        return self.make_state(moved_particles, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return keys of what follows, of the choice of particles, and of their states and modes (2, 2)."""
@@ -168,17 +169,16 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         """Return the law of f(x) + w of one particle; f is affine in what of x has a variance."""
         order = np.array(self.order)
         # Of a linear plant the drawn states may have a variance still; of others they are known.
-        noise, known = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
+        noise, known_count = factor_noise_covariance(plant, u), 0 if self._is_linear([plant]) else self.drawn
 
         def move(x: jax.Array) -> jax.Array:
             """Return f(x), drawn states first in x and in the result."""
             return plant.transition(self._in_plants_order(x), u)[order]
 
-        mean, slopes = slopes_given_drawn(move, x, known)
-        spread = WeightedColumns(slopes[:, known:], x.variances[known:])
-        return from_columns(
-            mean + plant.noise_mean()[order], join_columns(spread, WeightedColumns(noise.matrix[order], noise.weights))
-        )
+        mean, slopes = slopes_given_drawn(move, x, known_count)
+        propagated = WeightedColumns(slopes[:, known_count:], x.variances[known_count:])
+        columns = join_columns(propagated, WeightedColumns(noise.matrix[order], noise.weights))
+        return from_columns(mean + plant.noise_mean()[order], columns)
 
     def _in_plants_order(self, x: jax.Array) -> jax.Array:
         """Return x (..., n) in the order of the plant's states."""
@@ -188,15 +188,15 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
         """Draw mode and drawn states from a law q that knows z, weigh by p(z) p / q, and condition the rest on z."""
         z = jnp.asarray(z)
-        key, proposing = self.keys_of_correction(state.key, z)
-        weighed = self.weigh_particles(self.get_particles(state), None, None, proposing, z, k)
-        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
+        key, proposal_key = self.keys_of_correction(state.key, z)
+        weighed = self.weigh_particles(self.get_particles(state), law=None, numbers=None, key=proposal_key, z=z, k=k)
+        log_likelihood = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         # All weights zero: the row is not used.
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
         updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
-        used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (density > -jnp.inf)
-        after = update_if_used(used, updated, state._replace(key=key))
-        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
+        is_used = (self.uses_empty_rows | ~jnp.all(jnp.isnan(z))) & (log_likelihood > -jnp.inf)
+        after = update_if_used(is_used, updated, state._replace(key=key))
+        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return keys of what follows, and of the drawn states and of the choices (2, 2)."""
@@ -244,7 +244,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         position = self._in_plants_order(x)
         if len(sensors) == 1:
             return sensors[0].measure(position)
-        return jnp.stack([sensor.measure(position) for sensor in sensors])[jnp.array(self.sensor_modes)[mode]]
+        by_sensor = jnp.stack([sensor.measure(position) for sensor in sensors])
+        return by_sensor[jnp.array(self.sensor_modes)[mode]]
 
     def _draw_and_weigh(
         self,
@@ -295,11 +296,11 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return after, mode, log_density + log_p - log_q
 
     def _prior_share(self, sensors: Sequence[AbstractSensor], received: ReceivedByMode) -> float:
-        """Return the share of particles drawn without z: all if not `optimal`, none where drawing with z is exact."""
+        """Return the share of particles drawn without z: all if not `optimal`, none if drawing with z is exact."""
         if not self.optimal:
             return 1.0
         is_exact = all(isinstance(sensor, LinearSensor) for sensor in sensors) and received.weight.shape[1] == 1
-        return 0.0 if is_exact else PRIOR_SHARE  # PRIOR_SHARE: 0.1, which bounds the weights
+        return 0.0 if is_exact else PRIOR_SHARE
 
     def _linearised_posterior(
         self, sensors: Sequence[AbstractSensor], received: ReceivedByMode, mode: jax.Array, x: Gaussian
@@ -317,8 +318,9 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
     ) -> tuple[Gaussian, jax.Array]:
         """Return x = m + L xi given z = expected + slopes xi + v, and the log density of z."""
         value = wrap_near(z - expected, jnp.zeros(len(z)), self.observed_angles)
-        after, innovations = condition_on_observation(x, slopes, value, noise, ~jnp.isnan(z))
-        return after, innovations.log_density(~jnp.isnan(z), jnp.abs(z) + jnp.abs(expected))
+        present = ~jnp.isnan(z)
+        after, innovations = condition_on_observation(x, slopes, value, noise, present)
+        return after, innovations.log_density(present, jnp.abs(z) + jnp.abs(expected))
 
     def _condition_on_atoms(
         self,
@@ -332,7 +334,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, self.drawn)
 
         def condition_on_atom(gain: jax.Array, offset: jax.Array, noise: WeightedColumns) -> tuple[Gaussian, jax.Array]:
-            """Return x given z of one atom, and the log density of z."""
+            """Return x given z = gain h(x) + offset + noise, and log p(z); h(x) = y + slopes xi, x = m + L xi."""
             return self._condition_on_received(x, gain @ slopes, gain @ y + offset, noise, received.z)
 
         atoms = jax.tree.map(lambda leaf: leaf[mode], (received.gain, received.offset, received.noise))
@@ -350,11 +352,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
             """Return for each atom of the mode's mixture the mean (atoms, m) of z, and its covariance."""
             y, slopes = slopes_given_drawn(partial(self._measure, sensors, mode), x, drawn=0)
             gain = received.gain[mode]
-            spread = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
-            noise = jax.vmap(lambda matrix, weights: WeightedColumns(matrix, weights).covariance)(
-                *jax.tree.map(lambda leaf: leaf[mode], received.noise)
-            )
-            return gain @ y + received.offset[mode], spread + noise
+            of_state = jax.vmap(lambda g: WeightedColumns(g @ slopes, x.variances).covariance)(gain)
+            noise_columns = jax.tree.map(lambda leaf: leaf[mode], received.noise)
+            of_noise = jax.vmap(lambda columns: columns.covariance)(noise_columns)
+            return gain @ y + received.offset[mode], of_state + of_noise
 
         expected, total = jax.vmap(expect_in_mode)(jnp.arange(len(self.initial)), x)
         share = jax.nn.softmax(log_mode)[:, None] * received.weight
@@ -375,9 +376,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
         """Return z less its mean over particles, modes and the channel's atoms, its covariance, and log p(z)."""
-        return compute_mixture_innovation(
-            received, find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles), z, density
-        )
+        base = find_reference_innovation(ExpectedMixture(*reference), z, self.observed_angles)
+        return compute_mixture_innovation(received, base, z, density)
 
     def sum_for_mean(self, weight: jax.Array, particles: Cloud) -> StateSums:
         """Return the first sums of particles (B,), drawn states first."""
@@ -389,10 +389,10 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
         """Return mean and covariance over particles and modes; of an angle the mean direction, and moments about it."""
-        back, weight = np.argsort(self.order), sums.first.weight  # back: the inverse permutation, to the plant's order
+        plants_order, weight = np.argsort(self.order), sums.first.weight  # the inverse permutation
         mean = sums.first.mean(self._angles_in_order())
         modes = None if sums.modes is None else jnp.asarray(sums.modes) / weight
-        return Estimate(mean[back], (second / weight)[back][:, back], self.claim, modes)
+        return Estimate(mean[plants_order], (second / weight)[plants_order][:, plants_order], self.claim, modes)
 
     @estimates
     def estimate(self, state: PartlyDrawn) -> Estimate:

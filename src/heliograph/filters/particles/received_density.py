@@ -44,25 +44,10 @@ class ReceivedAtoms(Module):
 
         p is the sum over the atoms a of weight_a N(z; gain_a y + offset_a, noise_a). `angles`: components of z.
         """
-        present = ~jnp.isnan(z)
-        both = present[:, None] & present
 
         def compute_log_density(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> jax.Array:
-            """Return log N(z; gain y + offset, noise) of one atom (N,).
-
-            y (N, p): signals of N particles; `present` (m,): which components of z arrived, `both` (m, m): which pairs;
-            LOG_TURN: log 2 pi. -inf where E z is no number.
-            """
-            # z - E z, 0 for what did not arrive and for an E z that is no number.
-            expected = y @ gain.T + offset
-            valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
-            value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
-            value = jnp.where(valid[:, None] & present, value, 0.0)
-            # Whitened by the factor of the noise; what did not arrive has variance 1.
-            factor = jnp.linalg.cholesky(jnp.where(both, noise, jnp.eye(len(z))))
-            white = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
-            log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
-            return jnp.where(valid, -(jnp.sum(white**2, axis=1) + log_determinant) / 2, -jnp.inf)
+            """Return log N(z; gain y + offset, noise) of one atom (N,)."""
+            return _log_density_of_atom(y @ gain.T + offset, noise, z, angles)
 
         # log of the weighted sum over the atoms.
         atoms = jnp.asarray(self.gain), jnp.asarray(self.offset), jnp.asarray(self.noise)
@@ -78,8 +63,26 @@ class ReceivedAtoms(Module):
         """
         weight, offset = jnp.asarray(self.weight), jnp.asarray(self.offset)
         mean = weight @ offset
-        noise = jnp.einsum("a,aij->ij", weight, jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset))
-        return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, noise - jnp.outer(mean, mean)
+        second = jnp.asarray(self.noise) + jnp.einsum("ai,aj->aij", offset, offset)  # E[n n'] of each atom
+        covariance = jnp.einsum("a,aij->ij", weight, second) - jnp.outer(mean, mean)
+        return jnp.einsum("a,aij->ij", weight, jnp.asarray(self.gain)), mean, covariance
+
+
+def _log_density_of_atom(expected: jax.Array, noise: jax.Array, z: jax.Array, angles: Angles) -> jax.Array:
+    """Return log N(z; expected, noise) of the components of z (m,) that arrived, for each expectation (N, m).
+
+    `noise`: a covariance; `angles`: components of z; LOG_TURN: log 2 pi. -inf where what is expected is no number.
+    """
+    present = ~jnp.isnan(z)
+    # z - E z, 0 for what did not arrive and for an E z that is no number.
+    valid = jnp.all(jnp.isfinite(expected) | ~present, axis=1)
+    value = wrap_near(z - expected, jnp.zeros(len(z)), angles)
+    value = jnp.where(valid[:, None] & present, value, 0.0)
+    # Whitened by the factor of the noise; what did not arrive has variance 1.
+    factor = jnp.linalg.cholesky(jnp.where(present[:, None] & present, noise, jnp.eye(len(z))))
+    whitened = value @ jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(z)), lower=True).T
+    log_determinant = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + LOG_TURN * jnp.sum(present)
+    return jnp.where(valid, -(jnp.sum(whitened**2, axis=1) + log_determinant) / 2, -jnp.inf)
 
 
 class ReceivedDensity(Module):
@@ -93,13 +96,13 @@ class ReceivedDensity(Module):
     atoms: ReceivedAtoms
 
     def given_arrivals(self, z: jax.Array) -> tuple[ReceivedAtoms, jax.Array]:
-        """Return the atoms, and the chance (M,), of the smallest set in which all arrive that did, in each mode.
+        """Return the atoms, and the chance (M,), of the smallest set of arrivals that holds all that arrived, by mode.
 
-        Atoms: the Gaussians of what arrives, by mode and set of arrivals; the chance: of such a set.
+        Atoms: the Gaussians whose mixture is what arrives, by mode and set of arrivals.
         """
-        kind = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
-        chosen: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, kind], self.atoms)
-        return chosen, jnp.asarray(self.chance)[:, kind]
+        pattern = pattern_of(self, ~jnp.isnan(z)) if len(self.present) > 1 else 0
+        atoms: ReceivedAtoms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, pattern], self.atoms)
+        return atoms, jnp.asarray(self.chance)[:, pattern]
 
 
 def find_received_density(
@@ -160,7 +163,8 @@ def _check_noise(covariance: np.ndarray) -> None:
     CERTAIN: 1e-14, the eigenvalue of the noise's correlations up to which a combination has no noise.
     """
     deviation = np.sqrt(np.diagonal(covariance))
-    correlation = covariance / np.outer(*[np.where(deviation > 0, deviation, 1.0)] * 2)
+    unit = np.where(deviation > 0, deviation, 1.0)
+    correlation = covariance / np.outer(unit, unit)
     if len(covariance) and not np.min(np.linalg.eigvalsh(correlation)) > CERTAIN:
         expected = "noise in everything that arrives, so that it has a density (give the sensor or the link a variance)"
         raise fail("output of particles", expected, f"the covariance {covariance.tolist()}")
@@ -171,6 +175,7 @@ def _stack_atoms(atoms: Sequence[AffineComponent], count: int) -> ReceivedAtoms:
 
     An atom is one Gaussian of what arrives. Weights are divided by their sum.
     """
-    filled = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
-    weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*filled, strict=True))
+    padded = [*atoms, *[atoms[0]._replace(weight=0.0)] * (count - len(atoms))]
+    fields = zip(*padded, strict=True)
+    weight, gain, offset, noise = (np.stack([np.asarray(x, float) for x in field]) for field in fields)
     return ReceivedAtoms(weight=weight / weight.sum(), gain=gain, offset=offset, noise=noise)

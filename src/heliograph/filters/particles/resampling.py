@@ -1,5 +1,7 @@
 """Random numbers of particles: resampling of weighted ones, their normal numbers, and keys that depend on the data."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,38 +23,36 @@ def resample_systematically(weight: jax.Array, start: jax.Array) -> jax.Array:
 def resample_concrete_weights(weight: np.ndarray, start: float) -> np.ndarray:
     """Resample known weights (N,) of any sum like `resample_systematically`, in a time that does not grow by log N.
 
-    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; and of a j the
-    index is the count of those drawn for lower ones alone.
-
-    start in [0, 1): the one random number of systematic resampling.
+    Particle i is drawn for the j with N C_(i-1) < start + j <= N C_i, C the distribution function; of draw j the
+    index is the count of particles drawn for lower j alone. `start` in [0, 1): the one random number of systematic
+    resampling.
     """
     count, ends = len(weight), np.cumsum(weight)
     ends *= count / ends[-1]
     ends += 1 - start
-    places = np.minimum(ends.astype(np.int64), count)
-    places[-1] = count  # whatever rounding says
-    return np.cumsum(np.bincount(places)[:count])
+    count_below = np.minimum(ends.astype(np.int64), count)
+    count_below[-1] = count  # whatever rounding says
+    return np.cumsum(np.bincount(count_below)[:count])
 
 
 def draw_normals(key: jax.Array, numbers: jax.Array | None, size: int, particles: int) -> jax.Array:
     """Draw standard normal numbers (B, size) for the particles that `numbers` (B,) lists; for all `particles` if None.
 
-    Word w of a particle is the hash of its place among all words, so that particles draw the same side by side or one
-    by one. Of MANY numbers in all on they are of single precision, two from each 64 bits: those have 2^23 values, at
-    most 5.3, and take half of the time, in native code and in XLA's, which agree on them to single precision. Fewer
-    are those of `jax.random.normal(key, (particles, size))`, to the last digits in both.
-
-    MANY: 10,000; STEP: 2^-22, between two of the uniform numbers.
+    A number is a function of the key and of its index among all numbers, so that particles draw the same together or
+    one by one. Fewer than MANY (10,000) numbers in all are those of `jax.random.normal(key, (particles, size))`. More
+    are of single precision, two from each 64 random bits: 2^23 values, at most 5.3, in half of the time; native code
+    and XLA agree on them to single precision. STEP: 2^-22, between two of the uniform numbers.
     """
     if size * particles < MANY:
-        least = np.nextafter(-1.0, 0.0)
-        uniform = jnp.maximum(least, 2 * draw_uniforms(key, numbers, size, particles) + least)
+        smallest = np.nextafter(-1.0, 0.0)
+        uniform = jnp.maximum(smallest, 2 * draw_uniforms(key, numbers, size, particles) + smallest)
         # Uniform on (-1, 1), of which the inverse error function makes normal numbers.
         return jnp.sqrt(2.0) * jax.lax.erf_inv(uniform)
     words = draw_random_bits(key, numbers, -(-size // 2), particles)
-    halves = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
+    words_of_32_bits = jnp.concatenate([words >> np.uint64(32), words], axis=1)[:, :size].astype(jnp.uint32)
     # The middles of 2^23 parts of (-1, 1).
-    uniform = (halves >> 9).astype(jnp.int32).astype(jnp.float32) * np.float32(STEP) + np.float32(STEP / 2 - 1)
+    numbers_of_23_bits = (words_of_32_bits >> 9).astype(jnp.int32).astype(jnp.float32)
+    uniform = numbers_of_23_bits * np.float32(STEP) + np.float32(STEP / 2 - 1)
     return (np.float32(np.sqrt(2)) * jax.lax.erf_inv(uniform)).astype(float)
 
 
@@ -67,9 +67,10 @@ def draw_random_bits(key: jax.Array, numbers: jax.Array | None, size: int, parti
     """Draw `size` words of 64 bits, (B, size), for each of the particles of these numbers (B,), or for all."""
     if numbers is None:
         return jax.random.bits(key, (particles, size), dtype=jnp.uint64)
-    # The place of each word among those of all particles, which is folded into the key: two halves of 32 bits.
-    places = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
-    halves = jax.vmap(jax.vmap(lambda place: jax.random.fold_in(key, place)))(places).astype(jnp.uint64)
+    # The index of each word among those of all particles, which is folded into the key: two halves of 32 bits.
+    positions = numbers[:, None].astype(jnp.uint32) * np.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
+    fold_positions = jax.vmap(jax.vmap(partial(jax.random.fold_in, key)))  # over particles and words
+    halves = fold_positions(positions).astype(jnp.uint64)
     return halves[..., 0] << np.uint64(32) | halves[..., 1]
 
 

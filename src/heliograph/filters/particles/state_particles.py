@@ -86,8 +86,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         Their log weights are 0 (equal); `moved`: whether a step was predicted.
         """
-        key, own = self.start_keys()
-        x = self.draw_start(own, jnp.arange(self.particles))
+        key, start_key = self.start_keys()
+        x = self.draw_start(start_key, jnp.arange(self.particles))
         return self.make_state(x, jnp.zeros(self.particles), key)._replace(moved=jnp.asarray(False))
 
     def make_state(self, position: jax.Array, log_weight: jax.Array, key: jax.Array) -> StateParticles:
@@ -95,8 +95,8 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         `law`: of the last move, from which z may still draw again under the optimal proposal; here without spread.
         """
-        size = position.shape[1]
-        law = MoveLaw(position, jnp.zeros((size, size)), jnp.zeros_like(position)) if self.optimal else None
+        n = position.shape[1]
+        law = MoveLaw(position, jnp.zeros((n, n)), jnp.zeros_like(position)) if self.optimal else None
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def start_keys(self) -> tuple[jax.Array, jax.Array]:
@@ -109,8 +109,13 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         Each number has a random key of its own, so that one particle's draw does not depend on how many there are.
         """
-        plant = at(self.plant, 0)
-        drawn: jax.Array = jax.vmap(lambda number: plant.sample_initial(jax.random.fold_in(key, number)))(numbers)
+        plant = at(self.plant, k=0)
+
+        def draw(number: jax.Array) -> jax.Array:
+            """Draw x_0 of the particle of this number."""
+            return plant.sample_initial(jax.random.fold_in(key, number))
+
+        drawn: jax.Array = jax.vmap(draw)(numbers)
         return drawn
 
     @predicts
@@ -119,9 +124,12 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         `law`: of that move, which a proposal that knows z uses; None where it does not.
         """
-        key, choice, own = self.keys_of_prediction(state.key)
-        which, log_weight = self.choose_particles(state.log_weight, choice)
-        position, law = self.move_particles(state.position[which], None, own, jnp.asarray(u), k, state.moved)
+        key, choice_key, noise_key = self.keys_of_prediction(state.key)
+        chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
+        all_numbers = None
+        position, law = self.move_particles(
+            state.position[chosen], all_numbers, noise_key, jnp.asarray(u), k, state.moved
+        )
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
 
     def keys_of_prediction(self, key: jax.Array) -> jax.Array:
@@ -138,13 +146,15 @@ class StateParticleFilter(AbstractStateParticleFilter):
         plant = at(self.plant, k)
         center = jax.vmap(lambda one: plant.transition(one, u))(x)
         if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
-            every = jnp.arange(self.particles) if numbers is None else numbers
-            noise = jax.vmap(lambda number: plant.sample_noise(jax.random.fold_in(key, number), u))(every)
+            all_numbers = jnp.arange(self.particles) if numbers is None else numbers
+            noise = jax.vmap(lambda number: plant.sample_noise(jax.random.fold_in(key, number), u))(all_numbers)
             return wrap_angles(center + noise, plant.angles), None
         draws = draw_normals(key, numbers, x.shape[1], self.particles)
         center, root = center + plant.noise_mean(), _find_square_root(factor_noise_covariance(plant, u))
         position = wrap_angles(center + draws @ root.T, plant.angles)
-        return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u) if self.optimal else None
+        if not self.optimal:
+            return position, None
+        return position, self._find_law_of_move(plant, moved, MoveLaw(center, root, draws), u)
 
     def _find_law_of_move(self, plant: AbstractPlant, moved: jax.Array, law: MoveLaw, u: jax.Array) -> MoveLaw:
         """Return the law of x+ of each particle; at the first step of a linear plant that of x_0 and w together.
@@ -156,30 +166,29 @@ class StateParticleFilter(AbstractStateParticleFilter):
         """
         if not isinstance(plant, LinearPlant) or plant.deviation is not None or plant.circular:
             return law
-        start = at(self.plant, 0)
+        start = at(self.plant, k=0)
         start_moved = columns_of(start.initial_covariance).through(plant.transition_matrix(u))
         mean = plant.transition(jnp.asarray(start.initial_mean), u) + plant.noise_mean()
         center = jnp.where(moved, law.center, mean)
-        root = jnp.where(
-            moved, law.root, _find_square_root(join_columns(start_moved, factor_noise_covariance(plant, u)))
-        )
+        covariance = join_columns(start_moved, factor_noise_covariance(plant, u))  # of A x_0 + w
+        root = jnp.where(moved, law.root, _find_square_root(covariance))
         return law._replace(center=center, root=root)
 
     @corrects
     def correct(self, state: StateParticles, z: ArrayLike, k: Step = 0) -> tuple[StateParticles, Innovation]:
         """Weight each particle by the density of z, where the proposal is optimal after drawing it anew with z.
 
-        `density`: log p(z); a row that no particle explains is not used. `law`: of the last move, for drawing anew.
+        A row that no particle explains is not used. `law`: of the last move, for drawing anew.
         """
         z = jnp.asarray(z)
-        key, proposing = self.keys_of_correction(state.key, z)
-        weighed = self.weigh_particles(state.position, state.law, None, proposing, z, k)
-        density = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
+        key, proposal_key = self.keys_of_correction(state.key, z)
+        weighed = self.weigh_particles(state.position, state.law, numbers=None, key=proposal_key, z=z, k=k)
+        log_likelihood = jax.nn.logsumexp(jax.nn.log_softmax(state.log_weight) + weighed.log_likelihood)
         log_weight = relative_to_largest(state.log_weight + weighed.log_likelihood)
-        used = ~jnp.all(jnp.isnan(z)) & (density > -jnp.inf)
+        is_used = ~jnp.all(jnp.isnan(z)) & (log_likelihood > -jnp.inf)
         updated = self.make_state(weighed.particles, log_weight, key)._replace(moved=state.moved)
-        after = update_if_used(used, updated, state._replace(key=key))
-        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, density)
+        after = update_if_used(is_used, updated, state._replace(key=key))
+        return after, self.compute_innovation(state.weight, weighed.predicted, z, k, log_likelihood)
 
     def keys_of_correction(self, key: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return keys of what follows, and of the choice of those drawn from the prior."""
@@ -191,18 +200,17 @@ class StateParticleFilter(AbstractStateParticleFilter):
     ) -> WeighedParticles:
         """Weigh particles (B, n) by z, after they are drawn anew with it where the law of their move is given.
 
-        They expected h(x) before z was known (B, p).
-
-        `correction`: log of the law of the move over that of the draw. `numbers`: of the particles, None for all.
+        `predicted` (B, p): h(x), what they expected before z was known. `correction`: log of the law of the move over
+        that of the draw. `numbers`: of the particles, None for all.
         """
         sensor, atoms = at(self.sensor, k), self.find_received_atoms(z, k)
-        predicted = received = jax.vmap(sensor.measure)(position)
+        predicted = signal = jax.vmap(sensor.measure)(position)
         correction = jnp.zeros(len(position))
         if law is not None:
-            drawn = propose_particles(law, sensor, atoms, z, self.observed_angles, key, numbers, self.particles)
-            position, correction = wrap_angles(drawn.position, at(self.plant, k).angles), drawn.correction
-            received = jax.vmap(sensor.measure)(position)
-        likelihood = atoms.log_densities(received, z, self.observed_angles) + correction
+            proposed = propose_particles(law, sensor, atoms, z, self.observed_angles, key, numbers, self.particles)
+            position, correction = wrap_angles(proposed.position, at(self.plant, k).angles), proposed.correction
+            signal = jax.vmap(sensor.measure)(position)
+        likelihood = atoms.log_densities(signal, z, self.observed_angles) + correction
         return WeighedParticles(position, likelihood, (predicted,))
 
     def find_received_atoms(self, z: jax.Array, k: Step) -> ReceivedAtoms:
@@ -213,14 +221,13 @@ class StateParticleFilter(AbstractStateParticleFilter):
     def sum_received(
         self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
     ) -> tuple[FirstSums, jax.Array]:
-        """Return both sums of how far innovations of particles (B,) and atoms are from that of a reference.
+        """Return first and second sums of how far innovations of particles (B,) and atoms are from that of a reference.
 
-        Both: of first and of second order. Atoms: the Gaussians whose mixture the channel is; `predicted`: what
-        particles expect.
+        Atoms: the Gaussians whose mixture the channel is; `predicted`: what particles expect of z.
         """
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
-        both, apart = expected.find_innovations(weight, *predicted)
-        return first_sums(both, apart, ()), second_sums(both, apart)
+        joint_weight, difference = expected.find_innovations(weight, *predicted)
+        return first_sums(joint_weight, difference, angles=()), second_sums(joint_weight, difference)
 
     def innovation_from_sums(
         self,
@@ -234,9 +241,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
         `received`: first and second sums of innovations about that of the `reference` particle; `density`: log p(z).
         """
-        first, second = received
+        first_sums_of_innovations, second_sums_of_innovations = received
         expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
-        return expected.compute_innovation(first, second, density)
+        return expected.compute_innovation(first_sums_of_innovations, second_sums_of_innovations, density)
 
     def sum_for_mean(self, weight: jax.Array, position: jax.Array) -> StateSums:
         """Return the first sums of positions (B, n)."""
@@ -298,11 +305,11 @@ def build_state_particles(
         plant=plant,
         sensor=sensor,
         density=vary_over_steps(densities, sensor, channel),
-        resample=np.asarray(scalar("resample", resample, 0.0, 1.0)),
+        resample=np.asarray(scalar("resample", resample, low=0.0, high=1.0)),
         observed_angles=find_received_angles(plant, sensor, channel),
         particles=check_count("particles", particles),
         optimal=proposal == "optimal",
-        seed=np.asarray(check_count("seed", seed, 0)),
+        seed=np.asarray(check_count("seed", seed, least=0)),
         **make_sizes("nominal", start, first(channel).outputs),
     )
 

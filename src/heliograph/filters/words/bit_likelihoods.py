@@ -41,16 +41,17 @@ class LinkOfBits(Module):
     flag: int | None = eqx.field(static=True)
 
     def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
-        """Return the probabilities of the combinations given what was told; all modes alike where nothing was.
+        """Return the probability of each combination of bit error rates, given the mode that was told as z[flag].
 
-        `flag`: output at which the mode is told, None without modes; weights (modes, combinations of error rates).
+        `flag`: output at which the mode is told, None without modes; `weights` (modes, combinations): their
+        probabilities in each mode. All modes count alike where none was told.
         """
         weights = jnp.asarray(self.weights)
         if self.flag is None:
             return weights[0]
         mode = z[self.flag]
-        probabilities = jnp.where(jnp.isnan(mode), 1 / len(weights), mode == np.arange(len(weights)))
-        return probabilities @ weights
+        mode_probabilities = jnp.where(jnp.isnan(mode), 1 / len(weights), mode == np.arange(len(weights)))
+        return mode_probabilities @ weights
 
     def find_sent_likelihoods(self, received: Pairs) -> list[Pairs]:
         """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
@@ -87,19 +88,20 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
 
 
 def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
-    """Return the channel, without what is told, in each mode of its chain, where this is told last; else nothing.
+    """Return the channel in each mode of its chain, without the output that tells the mode; none where none is told.
 
-    A word is a number sent in bits; a channel tells the mode of its chain with an output of its own, a flag.
+    A channel of words (numbers sent in bits) may tell the mode of its only chain with an output of its own, a
+    `ModeOutput`, the last one.
     """
-    parts = channel.in_parallel
-    flags = [part for part in parts if isinstance(part, ModeOutput)]
+    outputs = channel.in_parallel
+    mode_outputs = [output for output in outputs if isinstance(output, ModeOutput)]
     chains = {link.memory.identity: link.memory for link in _list_modes(channel)}
     # One flag, of the only chain, and last.
-    is_told = len(flags) == 1 and set(chains) == {flags[0].memory.identity}
-    if not is_told or parts[-1] is not flags[0] or len(parts) < 2:
+    is_told = len(mode_outputs) == 1 and set(chains) == {mode_outputs[0].memory.identity}
+    if not is_told or outputs[-1] is not mode_outputs[0] or len(outputs) < 2:
         return []
     modes = next(iter(chains.values())).modes
-    return [Stack([_fix_mode(part, mode) for part in parts[:-1]]) for mode in range(modes)]
+    return [Stack([_fix_mode(output, mode) for output in outputs[:-1]]) for mode in range(modes)]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
@@ -173,10 +175,10 @@ def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
 
 def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
     """Return the product of likelihoods entry by entry; ones of this shape if there are none."""
-    result = jnp.ones(shape) if not factors else factors[0]
+    product = jnp.ones(shape) if not factors else factors[0]
     for factor in factors[1:]:
-        result = result * factor
-    return result
+        product = product * factor
+    return product
 
 
 def is_free_of_flips(link: LinkOfBits) -> bool:

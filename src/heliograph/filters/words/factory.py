@@ -62,10 +62,9 @@ def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
     """Return the sensor with the noise that it has before it rounds."""
     if not isinstance(sensor.noise, RoundedNoise):
         return sensor
-    # A copy with another noise: modules are frozen, so it is set past that.
-    twin = copy(sensor)
-    object.__setattr__(twin, "noise", sensor.noise.source)
-    return twin
+    unrounded = copy(sensor)
+    object.__setattr__(unrounded, "noise", sensor.noise.source)  # fields are frozen
+    return unrounded
 
 
 def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffine) -> SecondOrder:
@@ -74,11 +73,11 @@ def _find_moments_of_numbers(encoder: Words | None, channel: AbstractRandomAffin
     A word is a number sent in bits, its centre the middle of the range. Outputs that tell a mode are no words; moments
     are those given that the words arrive.
     """
-    words = [part for part in channel.in_parallel if not isinstance(part, ModeOutput)]
-    link = words[0] if len(words) == 1 else Stack(words)
+    word_links = [output for output in channel.in_parallel if not isinstance(output, ModeOutput)]
+    link = word_links[0] if len(word_links) == 1 else Stack(word_links)
     numbers = link if encoder is None else rewrite_about_centres(encoder, link)
-    forgets = without_memory(first(numbers).condition_on_arrival())
-    return second_order(first(forgets))
+    memoryless = without_memory(first(numbers).condition_on_arrival())
+    return second_order(first(memoryless))
 
 
 def word_filter(

@@ -54,21 +54,20 @@ Smooth = Callable[[jax.Array, jax.Array], LikelihoodStep]
 def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return Q(a) = P(t > a) and phi(a) of a >= 0, with one exponential and one reciprocal, to 5e-16 of themselves.
 
-    With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is smooth in c from -1 to 1.
-
-    POWERS: coefficients of the polynomial in c; CENTRE: K, 3.75.
+    With x = a / root 2 and c = (x - K) / (x + K), (1 + 2 x) e^(x^2) erfc x is a polynomial in c, from -1 to 1.
+    POWERS: its coefficients; CENTRE: K, 3.75.
 
     Source: Shepherd and Laframboise, Chebyshev approximation of (1 + 2 x) exp(x^2) erfc x (1981), in powers of c.
     """
     x = a * np.sqrt(0.5)
-    falling = jnp.exp(-x * x)
+    gaussian = jnp.exp(-x * x)
     reciprocal = 1 / ((x + CENTRE) * (1 + 2 * x))
     c = (x - CENTRE) * (1 + 2 * x) * reciprocal
     # Horner's rule.
-    ratio = jnp.full_like(a, POWERS[-1])
-    for power in POWERS[-2::-1]:
-        ratio = ratio * c + power
-    return ratio * ((x + CENTRE) * reciprocal) * (falling / 2), falling * (1 / ROOT_TWO_PI)
+    polynomial = jnp.full_like(a, POWERS[-1])
+    for coefficient in POWERS[-2::-1]:
+        polynomial = polynomial * c + coefficient
+    return polynomial * ((x + CENTRE) * reciprocal) * (gaussian / 2), gaussian * (1 / ROOT_TWO_PI)
 
 
 def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:

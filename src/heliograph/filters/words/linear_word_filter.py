@@ -62,7 +62,8 @@ class LinearWordsFilter(AbstractWrapper):
 
         The received row has the words and then their dithers, which are known numbers.
         """
-        after, innovation = self.base.correct(state, self._convert_words_to_numbers(jnp.asarray(z)), k)
+        numbers = self._convert_words_to_numbers(jnp.asarray(z))
+        after, innovation = self.base.correct(state, numbers, k)
         # Dithers have no innovation.
         dithers = self.received - len(self.centres)
         value = jnp.concatenate([jnp.asarray(innovation.value), jnp.full(dithers, jnp.nan)])
@@ -79,17 +80,18 @@ class LinearWordsFilter(AbstractWrapper):
         c: the words' centres; a dither was added before rounding, and is taken off times the mean gain. `flag`: index
         of the number that tells the mode, None without modes.
         """
-        values = z[: len(self.centres)] - jnp.asarray(self.centres)
+        about_centres = z[: len(self.centres)] - jnp.asarray(self.centres)
         if self.received == len(self.centres):
-            return values
+            return about_centres
         gains = jnp.asarray(self.gains)
         if self.flag is None:
             gain = gains[0]
         else:
             mode = z[self.flag]
-            gain = jnp.where(mode == jnp.arange(len(gains)), 1.0, 0.0) @ gains
-            gain = jnp.where(jnp.isnan(mode), jnp.nan, gain)
-        return values.at[np.array(self.words)].add(-gain * z[len(self.centres) :])
+            indicator = jnp.where(mode == jnp.arange(len(gains)), 1.0, 0.0)
+            gain = jnp.where(jnp.isnan(mode), jnp.nan, indicator @ gains)
+        dithers = z[len(self.centres) :]
+        return about_centres.at[np.array(self.words)].add(-gain * dithers)
 
 
 def build_behind_words(
@@ -189,13 +191,16 @@ def _gains_by_mode(laws: list[Channel], words: tuple[int, ...]) -> np.ndarray:
     return np.stack([_mean_gains(law)[list(words)] for law in laws])
 
 
-def _mean_gains(numbers: Channel) -> np.ndarray:
-    """Return E[g] of each output of a channel of numbers: its row sums, as each output carries one word."""
-    # `numbers`: the channel of the values that words stand for.
-    steps = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(numbers)]
-    if any(not np.array_equal(step, steps[0]) for step in steps):
+def _mean_gains(channel: Channel) -> np.ndarray:
+    """Return E[g] of each output of a channel of the numbers that words stand for: the row sums of E[G].
+
+    Each output carries one word, so that its row has one gain.
+    """
+    # `channel`: the channel of the values that words stand for.
+    gains_by_step = [np.asarray(second_order(link).mean_gain).sum(axis=1) for link in unstack(channel)]
+    if any(not np.array_equal(gains, gains_by_step[0]) for gains in gains_by_step):
         raise fail("channel of words whose dither is taken off", "the same mean gains at every step", "others")
-    return np.asarray(steps[0])
+    return np.asarray(gains_by_step[0])
 
 
 def _is_gaussian(plant: AnyPlant, sensor: AnySensor) -> bool:

@@ -111,17 +111,18 @@ def _sum_blocks(
         bits, `number` of the first block, `width` w of a cell; r is `ratio`, v the variance of prior and cell together.
         """
         sums, density, ratio, a = carried
-        inside = coefficients[-1]
-        for row in range(2**MERGED - 2, -1, -1):
-            inside = inside * ratio + coefficients[row]
+        polynomials = coefficients[-1]
+        for cell in range(2**MERGED - 2, -1, -1):
+            polynomials = polynomials * ratio + coefficients[cell]
         # Times e^(-a^2 / (2 v)) and the likelihood of the bits above; cell j is at a + j w.
-        inside = inside * (density * multiply_bits(pairs[MERGED:], number + block))
-        first, second = inside[1] * width, inside[2] * width**2
-        sums = sums.plus(LikelihoodSums(inside[0], a * inside[0] + first, a * (a * inside[0] + 2 * first) + second))
-        power = ratio  # r^J, J = 2^MERGED
+        polynomials = polynomials * (density * multiply_bits(pairs[MERGED:], number + block))
+        mass, first, second = polynomials[0], polynomials[1] * width, polynomials[2] * width**2
+        sums = sums.plus(LikelihoodSums(mass, a * mass + first, a * (a * mass + 2 * first) + second))
+        power = ratio
         for _ in range(MERGED):
             power = power**2
-        return (sums, density * power * bell_of_next_block, ratio * ratio_change, a + 2**MERGED * width), None
+        next_density = density * power * bell_of_next_block  # power: r^J, J = 2^MERGED cells a block
+        return (sums, next_density, ratio * ratio_change, a + 2**MERGED * width), None
 
     start = LikelihoodSums(*jnp.zeros(3)), jnp.exp(-(away**2) / (2 * wide)), jnp.exp(-away * width / wide), away
     (sums, *_), _ = jax.lax.scan(add_block, start, jnp.arange(BLOCKS, dtype=float))
@@ -129,18 +130,17 @@ def _sum_blocks(
 
 
 def _drop_low_bits(pairs: jax.Array, count: jax.Array) -> jax.Array:
-    """Return the likelihoods of the bits from number `count` on (bits, 2), filled with bits that are surely zero.
+    """Return the likelihoods of the bits from number `count` on (bits, 2), filled up with bits that are surely zero.
 
-    By shifts of 1, 2, 4, ... as the binary digits of `count` say, which is known at run time only.
-
-    Pairs (bits, 2): likelihoods that a bit was sent as 0 and as 1, the lowest first.
+    `pairs` (bits, 2): likelihoods that a bit was sent as 0 and as 1, the lowest first. `count` is known at run time
+    only: shifts of 1, 2, 4, ... are made as its binary digits say.
     """
-    shifted, rest, step = pairs, count, 1
-    while step < len(pairs):
-        half = jnp.floor(rest / 2)
-        sure = jnp.tile(jnp.array([1.0, 0.0]), (step, 1))
-        shifted = jnp.where(rest > 2 * half, jnp.concatenate([shifted[step:], sure]), shifted)
-        rest, step = half, 2 * step
+    shifted, quotient, shift = pairs, count, 1
+    while shift < len(pairs):
+        half = jnp.floor(quotient / 2)
+        certain_zeros = jnp.tile(jnp.array([1.0, 0.0]), (shift, 1))
+        shifted = jnp.where(quotient > 2 * half, jnp.concatenate([shifted[shift:], certain_zeros]), shifted)
+        quotient, shift = half, 2 * shift
     return shifted
 
 
@@ -154,5 +154,6 @@ def sum_overloads(pair: jax.Array, grid: WordGrid, prior: SignalPrior) -> Likeli
     outwards = jnp.array([-1.0, 1.0])
     t = (grid.low + (ends + outwards / 2) * grid.step - prior.mean) / prior.deviation
     a, likelihood = t * outwards, jnp.prod(pair, axis=0)
-    mass, density = (likelihood * part for part in signed_tail_and_density(a))
+    tail, phi = signed_tail_and_density(a)
+    mass, density = likelihood * tail, likelihood * phi
     return LikelihoodSums(jnp.sum(mass), jnp.sum(outwards * density), jnp.sum(mass + a * density))

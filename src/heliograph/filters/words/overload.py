@@ -65,12 +65,11 @@ class Overload(NamedTuple):
             filter: name of the filter.
         """
         share, bound = float(np.max(self.probability)), float(self.bound)
-        often = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
+        frequency = f"words of node {node!r} are overloaded in at most {share:.2g} of the steps"
         if not np.isfinite(bound):
-            return f"{often}, what that does to the claim of filter {filter!r} is not bounded"
-        return (
-            f"{often}, the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
-        )
+            return f"{frequency}, what that does to the claim of filter {filter!r} is not bounded"
+        error = f"the rms error of filter {filter!r} differs from its claim by at most {100 * bound:.2g}% for it"
+        return f"{frequency}, {error}"
 
 
 def bound_overload(
@@ -91,10 +90,10 @@ def bound_overload(
         encoder: of the words.
         places: component of each output of the channel.
     """
-    link = at(numbers, 0)
+    link = at(numbers, k=0)
     no_bound = link.past or link.remembers or any(place < 0 for place in places)
     horizon = min(STEPS, steps_covered((plant, sensor, numbers)) or STEPS)
-    outputs = len(at(sensor, 0).outputs)
+    outputs = len(at(sensor, k=0).outputs)
     step, half = encoder.each(encoder.step, outputs), encoder.each(encoder.high - encoder.low, outputs) / 2
     links = None if no_bound else _list_links(numbers, horizon)
     system, signals = _describe_system(plant, sensor, links, horizon)
@@ -113,7 +112,7 @@ def _describe_system(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, horizon: int
 ) -> tuple[LinearSystem | None, list[tuple[np.ndarray, np.ndarray]]]:
     """Return plant, sensor and links, where given, as a linear system, and mean and variance of y - c at each step."""
-    start = at(plant, 0)
+    start = at(plant, k=0)
     mean, covariance = np.asarray(start.initial_mean), np.asarray(start.initial_covariance)
     x, spread = mean, covariance
     parts, signals = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
@@ -143,7 +142,8 @@ def _find_models_of_step(
 
     `links`: moments of the link at each step, None where there is none.
     """
-    return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), None if links is None else links[k]
+    link = None if links is None else links[k]
+    return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), link
 
 
 @cache_by_object
@@ -250,9 +250,9 @@ def refuse_overload(overload: Overload) -> None:
     A word is overloaded if its number lies beyond the range. MOST: 1e-3; `bound`: share of the rms error, infinite if
     there is none.
     """
-    worst = float(np.max(overload.probability))
-    if worst > MOST:
+    largest = float(np.max(overload.probability))
+    if largest > MOST:
         bound = float(overload.bound)
-        off = f"; the claim may be off by {100 * bound:.3g}%" if np.isfinite(bound) else ""
+        consequence = f"; the claim may be off by {100 * bound:.3g}%" if np.isfinite(bound) else ""
         expected = "an overload in at most 1 of 1000 steps: widen low and high, or centre them (hg.model.centred)"
-        raise fail("range of the words", expected, f"{worst:.2g} a step{off}")
+        raise fail("range of the words", expected, f"{largest:.2g} a step{consequence}")

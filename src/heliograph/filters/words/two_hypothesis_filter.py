@@ -1,6 +1,5 @@
 """Filter behind words with two Gaussians: given that the last word was right in its leading bits, or that not."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -74,9 +73,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     @predicts
     def predict(self, state: Hypotheses, u: ArrayLike = (), k: Step = 0) -> Hypotheses:
         """Predict the Gaussians of both hypotheses: that the last words were right in their leading bits, or not."""
-        plant, size = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
-        move = partial(predict_gaussian, plant, self.base.transform, u=jnp.asarray(u), start=size)
-        return state._replace(parts=jax.vmap(lambda part: move(x=part))(state.parts))
+        plant, start = at(self.base.plant, k), second_moments_at_start(self.base.plant, self.base)
+        u = jnp.asarray(u)
+        predicted = jax.vmap(lambda x: predict_gaussian(plant, self.base.transform, x, u, start))(state.parts)
+        return state._replace(parts=predicted)
 
     @corrects
     def correct(self, state: Hypotheses, z: ArrayLike, k: Step = 0) -> tuple[Hypotheses, Innovation]:
@@ -84,14 +84,15 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.identify_received_words(z, at(base.links, k))
 
-        def append_measured(part: Gaussian) -> Gaussian:
-            """Return the joint law of the state and what is measured, under one hypothesis.
+        def append_measured(x: Gaussian) -> Gaussian:
+            """Return the joint law of the state x and the signal that is measured, under one hypothesis.
 
-            `base`: the filter of one Gaussian; a hypothesis: that the last words were right, or not.
+            A hypothesis: that the last words were right in their leading bits, or not. `base`: the filter of one
+            Gaussian; k: the step.
             """
-            signal = base.predict_signal(part, k)
+            signal = base.predict_signal(x, k)
             noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
-            return append_rows(part, signal.mean, signal.slopes, noise)
+            return append_rows(x, signal.mean, signal.slopes, noise)
 
         joint = Hypotheses(jax.vmap(append_measured)(state.parts), state.weights)
         begun, total = jnp.asarray(False), jnp.zeros(())
@@ -115,26 +116,27 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         """Return the smoother step of one Gaussian of the mixture's moments."""
         return smoother_step_by_transform(self.base, step.map_states(_merge_hypotheses), self.base)
 
-    def _split_by_answer(self, part: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
+    def _split_by_answer(self, hypothesis: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
         """Condition one hypothesis on word i, and on each answer to whether its leading bits are right: yes, no.
 
-        Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,).
+        Returns the hypothesis given each answer (2, ...), and the probabilities of word and answer (2,). A
+        hypothesis: that the last words were right, or not.
 
-        A hypothesis: that the last words were right, or not. LEADING: 3 bits; SURE: 1e-10, the share of probability
-        below which an answer is impossible. `row`: of y_i, in the root of the law of state and signal.
+        LEADING: 3 bits; SURE: 1e-10, the share of probability below which an answer is impossible. `row`: of y_i, in
+        the root of the law of state and signal.
         """
-        row = part.root[len(self.states) + i]
-        prior = self.base.find_signal_prior(part, i)
-        change = self.base.condition_by_leading_bits(i, words, prior, LEADING)
-        mass = jnp.exp(change.log_mass)
-        possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
+        row = hypothesis.root[len(self.states) + i]
+        prior = self.base.find_signal_prior(hypothesis, i)
+        effect = self.base.condition_by_leading_bits(i, words, prior, LEADING)
+        mass = jnp.exp(effect.log_mass)
+        is_possible = (mass > SURE * jnp.sum(mass)) & (prior.deviation > 0)
 
-        def impose(possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
+        def impose(is_possible: jax.Array, shift: jax.Array, ratio: jax.Array) -> Gaussian:
             """Return the hypothesis with these moments of y_i, as it is where the answer is impossible."""
-            shift, ratio = jnp.where(possible, shift, 0.0), jnp.where(possible, ratio, 1.0)
-            return impose_moments_of_combination(part, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
+            shift, ratio = jnp.where(is_possible, shift, 0.0), jnp.where(is_possible, ratio, 1.0)
+            return impose_moments_of_combination(hypothesis, row, shift * prior.deviation, jnp.maximum(ratio, 0.0))
 
-        return jax.vmap(impose)(possible, change.shift, change.ratio), jnp.where(possible, mass, 0.0)
+        return jax.vmap(impose)(is_possible, effect.shift, effect.ratio), jnp.where(is_possible, mass, 0.0)
 
     def _split_and_merge(
         self, joint: Hypotheses, i: int, words: ReceivedWords, begun: jax.Array
@@ -167,10 +169,9 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             """
             chosen_mass = jnp.where(chosen, mass, 0.0).ravel()
             probability = jnp.sum(chosen_mass)
-            shares_of_all = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
-            shares = jnp.where(
-                probability > 0, chosen_mass / jnp.where(probability > 0, probability, 1.0), shares_of_all
-            )
+            shares_if_none = jnp.where(total > 0, mass.ravel() / jnp.where(total > 0, total, 1.0), 0.25)
+            chosen_shares = chosen_mass / jnp.where(probability > 0, probability, 1.0)
+            shares = jnp.where(probability > 0, chosen_shares, shares_if_none)
             return merge_mixture(four_parts, shares), probability
 
         merged, weights = jax.vmap(merge_chosen)(jnp.stack([right, ~right]))

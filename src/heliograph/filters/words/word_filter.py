@@ -240,9 +240,12 @@ class ReceivedWords(NamedTuple):
 def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
     """Return presence, number and dither of the first copy that came; zeros of none.
 
-    Copies are tuples of these three; from the last to the first, so that the first one that came stays.
+    Copies are tuples of these three. They are passed from the last to the first, so that the first one that came
+    stays.
     """
-    chosen = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
-    for came, number, d in reversed(copies):
-        chosen = came | chosen[0], jnp.where(came, number, chosen[1]), jnp.where(came, d, chosen[2])
-    return chosen
+    some_is_present, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
+    for is_present, own_number, own_dither in reversed(copies):
+        some_is_present = is_present | some_is_present
+        number = jnp.where(is_present, own_number, number)
+        dither = jnp.where(is_present, own_dither, dither)
+    return some_is_present, number, dither

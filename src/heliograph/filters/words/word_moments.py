@@ -4,6 +4,7 @@ With L_i = P(received | word i sent), M = P(received) = E L(y) and t = (y - m)/s
 E[t L] and E[t^2 L]: E y = m + s E[t L]/M, Var y = s^2 (E[t^2 L]/M - (E[t L]/M)^2). The variance may be larger than s^2.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -35,19 +36,18 @@ LEAST = 1e-3  # width, in deviations, of the dither by which edges are smoothed:
 def sum_by_edges(
     t: jax.Array, jumps: jax.Array, at_zero: jax.Array, width: jax.Array, smooth: Smooth
 ) -> LikelihoodSums:
-    """Return the sums M, E[t L], E[t^2 L] of a likelihood L that is constant but for jumps at the edges t.
+    """Return the sums M, E[t L], E[t^2 L] of a likelihood L(t), t standard normal, constant but for jumps at edges.
 
-    `jumps`: L above each edge less L below it. `at_zero`: L(0). `width`: of the dither, in deviations.
-    M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t).
+    M = L(0) + sum_{t >= 0} J Q(t) - sum_{t < 0} J Q(-t), E[t L] = sum J phi(t), E[t^2 L] = M + sum J t phi(t) over
+    the edges t, Q and phi the normal tail and density.
 
-    Shapes: t (edges,), jumps (..., edges), at_zero (...), of several likelihoods at once.
-
-    t: a standard normal y; Q: its tail, phi: its density, J: a jump. LEAST: least width that changes anything.
+    `jumps`: J, L above each edge less L below it. `at_zero`: L(0). `width`: of the dither that smooths the edges, in
+    deviations, LEAST at least. Shapes: t (edges,), jumps (..., edges), at_zero (...), of several likelihoods at once.
     """
     sign = jnp.where(t < 0, -1.0, 1.0)
-    step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
-    mass = at_zero + jumps @ (sign * step.beyond)
-    return LikelihoodSums(mass, jumps @ step.density, mass + jumps @ (sign * step.slope))
+    smoothed_step = smooth(jnp.abs(t), jnp.maximum(width, LEAST))
+    mass = at_zero + jumps @ (sign * smoothed_step.beyond)
+    return LikelihoodSums(mass, jumps @ smoothed_step.density, mass + jumps @ (sign * smoothed_step.slope))
 
 
 def sum_neighbouring_words(
@@ -78,13 +78,21 @@ def sum_neighbouring_words(
     size = tables.shape[1]
 
     def weigh_bits_above(block: jax.Array) -> jax.Array:
-        """Return the likelihood of the bits above a block for each combination, times its probability."""
+        """Return the likelihood of the bits above a block (those that name it) for each combination of error rates,
+        times the combination's probability.
+
+        Closed over: `pairs`, likelihoods of the bits, `weights`; `start`, the first word's number; `size` of a block.
+        """
         return weights * jnp.stack([multiply_bits(pair[BLOCK:], start / size + block) for pair in pairs])
 
     def add_block(
         carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
     ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
-        """Add the edges of one block: those above each of its words."""
+        """Add the sums over the edges above each word of one block; `above`: the likelihood of the bits above it.
+
+        Closed over: `tables`, likelihoods of a block's words by their low bits; `blocks`, of `size` words each, the
+        first word's number being `start`; `grid`, the words; `prior` of y; the encoder's `dither`.
+        """
         total, above = carried
         following = weigh_bits_above(block + 1)
         likelihood = above @ tables
@@ -116,13 +124,14 @@ def sum_words_near_prior(
     probability.
     """
     count = WINDOW * 2**BLOCK
-    start = jnp.floor((prior.mean - REACH * prior.deviation - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK
+    lowest = prior.mean - REACH * prior.deviation
+    start = jnp.floor((lowest - grid.low) / (grid.step * 2**BLOCK)) * 2**BLOCK  # of the block that holds it
     start = jnp.clip(start, 0.0, 2.0**grid.bits - count)
-    sums = sum_neighbouring_words(pairs, weights, start, WINDOW, grid, prior, dither)
+    sums = sum_neighbouring_words(pairs, weights, start, blocks=WINDOW, grid=grid, prior=prior, dither=dither)
     # The word that was received, where it is none of these.
-    outside = (received < start) | (received >= start + count)
+    is_outside = (received < start) | (received >= start + count)
     likelihood = weights @ jnp.stack([multiply_bits(pair, received) for pair in pairs])
-    return sums.plus(sum_one_word(likelihood * outside, received, grid, prior, dither))
+    return sums.plus(sum_one_word(likelihood * is_outside, received, grid, prior, dither))
 
 
 def sum_one_word(
@@ -135,9 +144,10 @@ def sum_one_word(
     """
     edges = index + jnp.array([-0.5, 0.5])
     t = (grid.low + edges * grid.step - prior.mean) / prior.deviation
-    if grid.bits:  # overloads: the end words have one edge, the other one is BEYOND_ALL deviations away
-        t = jnp.where(jnp.array([True, False]) & (index <= 0), -BEYOND_ALL, t)
-        t = jnp.where(jnp.array([False, True]) & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
+    if grid.bits:  # overloads: the first word has no lower edge, the last no upper one
+        is_lower, is_upper = jnp.array([True, False]), jnp.array([False, True])
+        t = jnp.where(is_lower & (index <= 0), -BEYOND_ALL, t)
+        t = jnp.where(is_upper & (index >= 2.0**grid.bits - 1), BEYOND_ALL, t)
     # Up at the lower edge and down at the upper one; L(0) counts if 0 lies between.
     jumps = likelihood[..., None] * jnp.array([1.0, -1.0])
     at_zero = likelihood * ((t[0] < 0) & (t[1] >= 0))
@@ -157,10 +167,11 @@ def find_effect_from_sums(sums: LikelihoodSums) -> WordEffect:
 
     Sums M = E L, E[t L], E[t^2 L] of a likelihood L give log M, the mean of t, and its variance.
     """
-    possible = sums.mass > np.finfo(float).tiny
-    mass = jnp.where(possible, sums.mass, 1.0)
-    shift = sums.first / mass
-    return WordEffect(jnp.where(possible, jnp.log(mass), -jnp.inf), shift, sums.second / mass - shift**2)
+    is_possible = sums.mass > np.finfo(float).tiny
+    mass = jnp.where(is_possible, sums.mass, 1.0)
+    mean = sums.first / mass
+    log_mass = jnp.where(is_possible, jnp.log(mass), -jnp.inf)
+    return WordEffect(log_mass, mean, sums.second / mass - mean**2)
 
 
 def widen_by_dither(prior: SignalPrior, grid: WordGrid, dither: str) -> tuple[SignalPrior, jax.Array]:
@@ -180,16 +191,17 @@ def find_effect_of_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior, di
     ADDED: variance of a dither, in squared steps, 0 for one that is taken off. FINE: least width of a step that is not
     small; FAR: deviations from which edges have no digits.
     """
-    wider, wide = widen_by_dither(prior, grid, dither)
-    cut = remove_dither(_cut_to_cell(index, grid, wider), wide)
+    wider, variance_ratio = widen_by_dither(prior, grid, dither)
+    by_cell = remove_dither(_cut_to_cell(index, grid, wider), variance_ratio)
     if not ADDED[dither]:
-        return cut
+        return by_cell
     # A dither of steps that are not small: the edges are smooth, but far away only cells have digits.
     away = jnp.abs((grid.low + index * grid.step - prior.mean) / prior.deviation)
     width = grid.step / prior.deviation
-    smooth = find_effect_from_sums(sum_one_word(jnp.ones(()), index, grid, prior, dither))
-    use = (width >= FINE) & (away - width < FAR)
-    return WordEffect(*(jnp.where(use, a, b) for a, b in zip(smooth, cut, strict=True)))
+    by_smooth_edges = find_effect_from_sums(sum_one_word(jnp.ones(()), index, grid, prior, dither))
+    is_smooth_valid = (width >= FINE) & (away - width < FAR)
+    effect: WordEffect = jax.tree.map(lambda a, b: jnp.where(is_smooth_valid, a, b), by_smooth_edges, by_cell)
+    return effect
 
 
 def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEffect:
@@ -210,6 +222,30 @@ def _cut_to_cell(index: jax.Array, grid: WordGrid, prior: SignalPrior) -> WordEf
     log_mass = -(centre**2) / 2 - np.log(ROOT_TWO_PI) + jnp.log(2 * half)
     short = WordEffect(log_mass, centre * (1 - half**2 / 3), half**2 / 3)
     return WordEffect(*(jnp.where(narrow_cell, a, b) for a, b in zip(short, cut, strict=True)))
+
+
+def _sum_wide_words(
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> WordEffect:
+    """Return the effect of a word on y by a sum over the words within the prior's reach: 8.5 deviations of its mean.
+
+    Arguments are those of `find_effect_of_bits`.
+    """
+    return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
+
+
+def _sum_fine_words(
+    pairs: list[jax.Array], weights: jax.Array, received: jax.Array, grid: WordGrid, prior: SignalPrior, dither: str
+) -> WordEffect:
+    """Return the effect of a word on y by a sum over cells of several words, and over what lies beyond the end words.
+
+    The dither's variance widens the prior, and is removed after. Arguments are those of `find_effect_of_bits`.
+    """
+    wider, variance_ratio = widen_by_dither(prior, grid, dither)
+    sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
+    # Each sum is the mean over the combinations of error rates.
+    mean_sums = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
+    return remove_dither(find_effect_from_sums(mean_sums), variance_ratio)
 
 
 def find_effect_of_bits(
@@ -233,20 +269,7 @@ def find_effect_of_bits(
         blocks = 2 ** max(grid.bits - BLOCK, 0)
         return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
 
-    def sum_wide_words() -> WordEffect:
-        """Sum word by word within the prior's reach."""
-        return find_effect_from_sums(sum_words_near_prior(pairs, weights, received, grid, prior, dither))
-
-    def sum_fine_words() -> WordEffect:
-        """Sum over cells of several words each, and over the overloads beyond the ends.
-
-        `pairs`: likelihoods of bits for each law of the link, `weights` the laws' probabilities. The dither's variance
-        widens the prior, and is removed after.
-        """
-        wider, wide = widen_by_dither(prior, grid, dither)
-        sums = [sum_merged_words(pair, received, grid, wider).plus(sum_overloads(pair, grid, wider)) for pair in pairs]
-        merged = LikelihoodSums(*(weights @ jnp.stack(terms) for terms in zip(*sums, strict=True)))
-        return remove_dither(find_effect_from_sums(merged), wide)
-
+    word = pairs, weights, received, grid, prior, dither
+    sum_wide_words, sum_fine_words = partial(_sum_wide_words, *word), partial(_sum_fine_words, *word)
     effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)
     return effect

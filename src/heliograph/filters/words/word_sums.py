@@ -43,13 +43,13 @@ def multiply_bits(pairs: jax.Array, numbers: jax.Array) -> jax.Array:
         pairs: likelihoods of a zero and a one of each bit, the lowest first, (bits, 2).
         numbers: whole numbers from 0 (...,).
     """
-    rest, likelihood = numbers, jnp.ones(numbers.shape)
-    for zero, one in pairs:
-        # The lowest binary digit is 1 where the rest is odd.
-        half = jnp.floor(rest / 2)
-        likelihood = likelihood * jnp.where(rest > 2 * half, one, zero)
-        rest = half
-    return jnp.where(rest > 0, 0.0, likelihood)
+    quotient, likelihood = numbers, jnp.ones(numbers.shape)
+    for if_zero, if_one in pairs:
+        # The lowest binary digit is 1 where the quotient is odd.
+        half = jnp.floor(quotient / 2)
+        likelihood = likelihood * jnp.where(quotient > 2 * half, if_one, if_zero)
+        quotient = half
+    return jnp.where(quotient > 0, 0.0, likelihood)
 
 
 def tabulate_likelihoods(pair: jax.Array) -> jax.Array:

@@ -34,15 +34,15 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
         `make`: the function that makes the filter; `parameters`: its signature.
         """
-        given = parameters.bind(*args, **kwargs)
-        plant = given.arguments.get("plant")
+        bound = parameters.bind(*args, **kwargs)
+        plant = bound.arguments.get("plant")
         start = first(plant)
         if not isinstance(start, AbstractPlant) or not start.limits:
             return make(*args, **kwargs)
         from heliograph.filters.wrappers.state_limits import build_limited_filter, without_limits
 
-        given.arguments["plant"] = without_limits(cast(Any, plant))
-        return cast(F, build_limited_filter(make(*given.args, **given.kwargs), cast(Any, plant)))
+        bound.arguments["plant"] = without_limits(cast(Any, plant))
+        return cast(F, build_limited_filter(make(*bound.args, **bound.kwargs), cast(Any, plant)))
 
     return build_limited
 
@@ -98,8 +98,8 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
         `make`: the function that makes the filter; `parameters`: its signature. A channel may report numbers, such as
         its gain, with each z.
         """
-        given = parameters.bind(*args, **kwargs).arguments
-        channel = given.get("channel")
+        arguments = parameters.bind(*args, **kwargs).arguments
+        channel = arguments.get("channel")
         # What is no channel reports nothing, and is for `make` to refuse.
         is_channel = isinstance(first(channel), AbstractRandomAffine)
         reports_numbers = is_channel and len(separate_told_numbers(first(channel)).numbers) > 0
@@ -107,7 +107,7 @@ def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
             return make(*args, **kwargs)
         from heliograph.filters.wrappers.told_link_law import FilterMaker, build_told_filter
 
-        plant, sensor, link = (given.pop(name) for name in ("plant", "sensor", "channel"))
-        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, given)))
+        plant, sensor, link = (arguments.pop(name) for name in ("plant", "sensor", "channel"))
+        return cast(F, build_told_filter(plant, sensor, link, FilterMaker(make, arguments)))
 
     return build_with_told_numbers

@@ -99,11 +99,12 @@ class ClockFilter(AbstractWrapper):
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
         """Predict plant and clocks over step k.
 
-        `silence`: steps since each component arrived.
+        `silence`: steps since each component arrived, one more now. `observed`: which clocks' offsets were
+        observable.
         """
-        moved = self.base.predict(state.gaussian, u, k)
+        predicted = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
-            gaussian=moved, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
+            gaussian=predicted, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
         )
 
     @corrects
@@ -139,7 +140,8 @@ class ClockFilter(AbstractWrapper):
         """
         mask = jnp.ones(len(self.states))
         for i, offset in enumerate(self.offsets):
-            mask = mask.at[offset : offset + 2].set(jnp.where(observed[i], 1.0, 0.0))
+            offset_and_drift = slice(offset, offset + 2)
+            mask = mask.at[offset_and_drift].set(jnp.where(observed[i], 1.0, 0.0))
         return mask
 
     def _test_observable(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
@@ -152,14 +154,14 @@ class ClockFilter(AbstractWrapper):
         """
         jacobian = jax.jacfwd(observe)
         slopes, curvature = jacobian(state.gaussian.mean), jax.jacfwd(jacobian)(state.gaussian.mean)
-        independent = self._independent_shares(state, observe, k)
+        independent_share = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
             # Variance of dy/do of each received component: dy/do is to first order linear in the state.
             gradient = curvature[:, offset]
             variance = jnp.einsum("ri,ij,rj->r", gradient, state.gaussian.covariance, gradient)
-            moves = jnp.any(slopes[:, offset] ** 2 > SIGNIFICANT * variance)
-            observable.append(moves & (independent[i] > SHARE))
+            is_significant = jnp.any(slopes[:, offset] ** 2 > SIGNIFICANT * variance)
+            observable.append(is_significant & (independent_share[i] > SHARE))
         return jnp.stack(observable)
 
     def _independent_shares(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
@@ -173,33 +175,32 @@ class ClockFilter(AbstractWrapper):
         def move_and_give_gramian_part(
             carry: tuple[jax.Array, jax.Array], _: None
         ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-            """Move one step on; the output is one step's part of O'O.
+            """Move one step on; the output is the step's term of O'O, O the observability matrix (C; C F; C F F; ...).
 
-            O'O: square of the observability matrix; `observe`: the outputs of a state.
+            `carry`: the state at a later step, and its derivatives by the present state; `observe`: the outputs of a
+            state. `state.inputs` are taken to stay.
             """
-            x, from_present = carry  # the state at a later step, and its derivatives by the present state
-            rows = jax.jacfwd(observe)(x) @ from_present
-            step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
-            return (plant.transition(x, state.inputs), step @ from_present), rows.T @ rows
+            x, slopes_by_present = carry
+            rows = jax.jacfwd(observe)(x) @ slopes_by_present
+            transition_slopes = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
+            return (plant.transition(x, state.inputs), transition_slopes @ slopes_by_present), rows.T @ rows
 
         _, squares = jax.lax.scan(move_and_give_gramian_part, (state.gaussian.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_compute_unexplained_share(jnp.sum(squares, axis=0), offset) for offset in self.offsets])
 
 
-def _compute_unexplained_share(square: jax.Array, column: int) -> jax.Array:
+def _compute_unexplained_share(gramian: jax.Array, column: int) -> jax.Array:
     """Return 1 - r' R^+ r, the share of one column of O that the others leave unexplained; 0 of a column of zeros.
 
-    R are the correlations (cosines) of the other columns, r those of this column with them; O'O = `square`.
-
-    O: rows of the outputs' derivatives. RANK: 1e-12, the share of the largest eigenvalue below which a direction is
-    none.
+    R are the correlations (cosines) of the other columns, r those of this column with them; `gramian`: O'O, O a
+    matrix of outputs' derivatives. RANK: 1e-12, the share of the largest eigenvalue below which a direction is none.
     """
-    lengths = jnp.sqrt(jnp.diagonal(square))
+    lengths = jnp.sqrt(jnp.diagonal(gramian))
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)
-    correlations = scale[:, None] * square * scale
-    others = jnp.array([i for i in range(square.shape[0]) if i != column])
-    among, r = correlations[jnp.ix_(others, others)], correlations[others, column]
-    values, vectors = eigh(among)
+    correlations = scale[:, None] * gramian * scale
+    others = jnp.array([i for i in range(gramian.shape[0]) if i != column])
+    R, r = correlations[jnp.ix_(others, others)], correlations[others, column]
+    values, vectors = eigh(R)
     is_used = values > RANK * values[-1]
     explained = jnp.sum(jnp.where(is_used, (vectors.T @ r) ** 2 / jnp.where(is_used, values, 1.0), 0.0))
     return jnp.where(lengths[column] > 0, 1 - explained, 0.0)

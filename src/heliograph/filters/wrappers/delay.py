@@ -48,6 +48,7 @@ class PartFilter(AbstractWrapper):
     base: AbstractFilter
 
     def __init__(self, base: AbstractFilter, states: int):
+        """Wrap the filter `base` so that only its first `states` states are estimated."""
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
@@ -60,7 +61,8 @@ class PartFilter(AbstractWrapper):
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)
         projection = jnp.eye(len(self.base.states)) if plan.projection is None else jnp.asarray(plan.projection)
-        return replace(plan, covariances=plan.covariances[:, :n, :n], projection=projection[:n], states=self.states)
+        covariances = plan.covariances[:, :n, :n]
+        return replace(plan, covariances=covariances, projection=projection[:n], states=self.states)
 
 
 def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
@@ -110,7 +112,7 @@ class RelayLinesFilter(AbstractWrapper):
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """Move the plant, send the sensor's signal, and receive it at one relay after another.
 
-        A line holds what a relay received in the last steps.
+        `lines`: where each relay's line, what it received in the last steps, lies in the state.
         """
         state = self.base.predict(state, u, k)
         for link, line in zip(self.links, self.lines, strict=True):
@@ -172,15 +174,14 @@ def enlarge_by_relays(
 def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant | Plant:
     """Enlarge the plant by the line of a relay: what it received 0 to `steps` steps ago, `size` numbers each.
 
-    The line shifts by one place at each step, and leaves its first place empty for what is received.
-
-    A matrix of shift moves each place's numbers to the next; the line has no noise of its own.
+    At each step the line shifts its numbers to the next place, without noise; its first place is left for what is
+    received.
     """
-    held = size * (1 + steps)
+    length = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
-    shift, nothing = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((held, held))
-    line = LinearPlant(shift, nothing, np.zeros(held), nothing, states=names)
-    return append_driving_plant(plant, line, np.zeros((len(plant.states), held)))
+    shift_matrix, no_noise = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((length, length))
+    line = LinearPlant(shift_matrix, no_noise, np.zeros(length), no_noise, states=names)
+    return append_driving_plant(plant, line, np.zeros((len(plant.states), length)))
 
 
 def relayed_filter(plant: AnyPlant, channel: RelayedLinks, base: AbstractFilter, lines: PyTree) -> RelayLinesFilter:
@@ -220,6 +221,7 @@ class LateFilter(AbstractWrapper):
     delay: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractFilter, delay: int):
+        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late."""
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
 
@@ -237,8 +239,8 @@ class LateFilter(AbstractWrapper):
         """
         inputs = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])  # of steps k - delay to k
         sent_at = jnp.asarray(k) - self.delay
-        moved = self._predict_if_begun(state.base, inputs[0], sent_at)
-        return LateState(moved, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
+        predicted = self._predict_if_begun(state.base, inputs[0], sent_at)
+        return LateState(predicted, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
 
     def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """Predict over step k, or return the state as it is where k < 0."""
@@ -254,21 +256,22 @@ class LateFilter(AbstractWrapper):
         sent_at = jnp.asarray(k) - self.delay
         after, innovation = self.base.correct(state.base, z, jnp.maximum(sent_at, 0))
         base = jax.tree.map(lambda new, old: jnp.where(sent_at >= 0, new, old), after, state.base)
-        likelihood = jnp.where(sent_at >= 0, innovation.log_likelihood, 0.0)
+        log_likelihood = jnp.where(sent_at >= 0, innovation.log_likelihood, 0.0)
         weight = None if innovation.weight is None else jnp.where(sent_at >= 0, innovation.weight, jnp.nan)
-        return state._replace(base=base), replace(innovation, log_likelihood=likelihood, weight=weight)
+        return state._replace(base=base), replace(innovation, log_likelihood=log_likelihood, weight=weight)
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
         """Return the prediction over the last `delay` steps."""
 
-        def move(j: jax.Array, base: PyTree) -> PyTree:
+        def predict_over(j: jax.Array, base: PyTree) -> PyTree:
             """Predict over the step j after that of the last signal."""
             return self._predict_if_begun(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
 
         if not self.delay:
             return self.base.estimate(state.base)
-        return self.base.estimate(jax.lax.fori_loop(0, self.delay, move, jax.tree.map(jnp.asarray, state.base)))
+        present = jax.lax.fori_loop(0, self.delay, predict_over, jax.tree.map(jnp.asarray, state.base))
+        return self.base.estimate(present)
 
     def after_step(self, state: LateState, k: Step) -> Estimate:
         """Return the prediction over the last `delay` steps."""
@@ -289,13 +292,13 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
 
     Source: prediction from the last filtered time; equal to augmenting the state with past signals.
     """
-    late = LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+    instance("filter", filter, AbstractFilter, "a filter")
+    delayed_filter = LateFilter(filter, check_count("delay", delay, least=0))
     premise = filter.premise
     if premise is None or not delay or premise.channel is None:
-        return with_premise(late, premise)
-    return with_premise(
-        late, premise.replaced(channel=at_each_step(lambda link: delayed(link, delay), premise.channel))
-    )
+        return with_premise(delayed_filter, premise)
+    channel = at_each_step(lambda link: delayed(link, delay), premise.channel)
+    return with_premise(delayed_filter, premise.replaced(channel=channel))
 
 
 class KnownDelayFilter(AbstractWrapper):
@@ -313,8 +316,8 @@ class KnownDelayFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the channel of the received delay; without a delay nothing is used."""
-        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]  # the last number
+        """Correct with the channel of the received delay, the last number of z; without a delay nothing is used."""
+        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
         is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
         channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
@@ -323,9 +326,9 @@ class KnownDelayFilter(AbstractWrapper):
         after = jax.tree.map(lambda new, old: jnp.where(is_known, new, old), after, state)
         # The delay itself is a component of z too, of which the innovation tells nothing.
         delay_innovation, covariance = append_flag(innovation.covariance, delay)
-        likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
+        log_likelihood = jnp.where(is_known, innovation.log_likelihood, 0.0)
         weight = None if innovation.weight is None else jnp.append(innovation.weight, jnp.nan)
-        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, likelihood, weight)
+        return after, Innovation(jnp.append(innovation.value, delay_innovation), covariance, log_likelihood, weight)
 
 
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
@@ -353,8 +356,8 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
     """Build the filter behind relays that store what they received."""
     if not isinstance(channel, RelayedLinks):
         raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
-    larger, last, link, lines = enlarge_by_relays(plant, sensor, channel)
-    return relayed_filter(plant, channel, make(larger, last, link), lines)
+    enlarged_plant, last_sensor, link, lines = enlarge_by_relays(plant, sensor, channel)
+    return relayed_filter(plant, channel, make(enlarged_plant, last_sensor, link), lines)
 
 
 def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
@@ -362,9 +365,9 @@ def _build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Chann
     if not isinstance(channel, DelayedLink):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
-    larger, past_signals, _ = with_past(plant, sensor, channel)
+    enlarged_plant, past_signals, _ = with_past(plant, sensor, channel)
     links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
-    base, start = make(larger, past_signals, links[0]), first(plant)
+    base, start = make(enlarged_plant, past_signals, links[0]), first(plant)
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),
@@ -384,4 +387,5 @@ def _deliver_at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
     if isinstance(channel, RelayedLinks):
         # First repeat the signal on all places, then take it from the line as the channel does.
         return Series([_deliver_at_once(stage) for stage in channel.stages])
-    return Series([known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1))), place_on_delay_line(channel)])
+    repeat = known(np.tile(np.eye(signal_size(channel)), (1 + channel.past, 1)))
+    return Series([repeat, place_on_delay_line(channel)])

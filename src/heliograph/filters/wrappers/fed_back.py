@@ -43,6 +43,7 @@ class PredictionFilter(AbstractWrapper):
     base: GaussianFilter
 
     def __init__(self, base: GaussianFilter):
+        """Wrap the Gaussian filter `base`, whose predictions are to be the estimates."""
         self.base, self.claim = base, base.claim
         self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 
@@ -135,9 +136,8 @@ class FedBackFilter(AbstractWrapper):
         """Correct with the measurement of y - r, r the reference that the sender subtracts from its signal y."""
         base = self.base
         plant, sensor = at(base.plant, k), at(base.sensor, k)
-        y = find_signal_moments(
-            plant, sensor, base.transform, state.gaussian, second_moments_at_start(base.plant, base)
-        )
+        start = second_moments_at_start(base.plant, base)
+        y = find_signal_moments(plant, sensor, base.transform, state.gaussian, start)
         # What is sent is y - r: of another mean and second moment, and the same covariance.
         mean = y.mean - state.reference
         sent = y._replace(mean=mean, second=y.covariance + jnp.outer(mean, mean))

@@ -71,8 +71,8 @@ def mean_error_bound(
     if not (isinstance(filter, ToldFilter) and isinstance(filter.base, LinearFilter)):
         got = type(filter).__name__ if isinstance(filter, AbstractFilter) else show_value(filter)
         raise fail("filter", "a linear_filter behind a link without memory that tells numbers", got)
-    given = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
-    u = check_rows("inputs", given, steps, len(filter.inputs), missing=False)
+    rows_of_inputs = np.zeros((steps, 0)) if inputs is None and not filter.inputs else inputs
+    u = check_rows("inputs", rows_of_inputs, steps, len(filter.inputs), missing=False)
     return np.asarray(_bound_mean_covariance(filter, _list_told_numbers(filter), np.asarray(u)))
 
 
@@ -94,7 +94,7 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     def corrected_covariance(prior: LinearBelief, numbers: jax.Array, k: jax.Array) -> jax.Array:
         """Return f(P, a): the covariance P of `prior` after a message with the numbers a; its values do not matter."""
         z = jnp.zeros(filter.received).at[np.array(filter.numbers)].set(numbers)
-        after: LinearBelief = filter.correct(prior, z, k)[0]
+        after, _ = filter.correct(prior, z, k)
         covariance: jax.Array = after.gaussian.covariance
         return covariance
 
@@ -106,11 +106,15 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
         def step_in_mode(
             covariance: jax.Array, numbers: jax.Array, weights: jax.Array
         ) -> tuple[LinearBelief, jax.Array]:
-            """Return the prediction, and the mean covariance after it over the numbers (count, told) of this mode."""
+            """Return the prediction in one mode, and the mean covariance after the message, sum_a p(a) f(P, a).
+
+            `covariance`: before the step; `numbers` (count, told): the messages a that the mode may bring, `weights`
+            their probabilities. Closed over: the `filter`, its `state`, input `u_k` and number k of the step.
+            """
             gaussian = from_covariance(state.gaussian.mean, covariance)
             prior = filter.predict(state._replace(gaussian=gaussian), u_k, k)
-            after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
-            return prior, jnp.tensordot(weights, after, 1)
+            covariances_after = jax.vmap(lambda a: corrected_covariance(prior, a, k))(numbers)
+            return prior, jnp.tensordot(weights, covariances_after, 1)
 
         priors, after = jax.vmap(step_in_mode)(before, jnp.asarray(told.numbers), jnp.asarray(told.weights))
         # V of each mode of the next step: the mean over the modes that may come before it.

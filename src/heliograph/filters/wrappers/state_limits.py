@@ -72,7 +72,8 @@ class LimitedFilter(AbstractSizedFilter):
         """Correct the prediction, its mean held within the limits; the likelihood of z is that given the limits."""
         after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
-        log_within_after, log_within_before = self._log_probability_within(after), self._log_probability_within(state)
+        log_within_after = self._log_probability_within(after)
+        log_within_before = self._log_probability_within(state)
         are_possible = jnp.isfinite(log_within_after) & jnp.isfinite(log_within_before)
         change = jnp.where(are_possible, log_within_after - log_within_before, 0.0)
         return after, replace(innovation, log_likelihood=innovation.log_likelihood + change)
@@ -209,13 +210,13 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
     """Return the plant without limits of its states."""
 
     def drop_limits(limited: AbstractPlant) -> AbstractPlant:
-        """Return a copy of the plant at one step; modules are frozen, so it is set past that."""
-        free = copy(limited)
-        object.__setattr__(free, "limits", ())
-        return free
+        """Return a copy of the plant of one step, without limits."""
+        unlimited = copy(limited)
+        object.__setattr__(unlimited, "limits", ())  # fields are frozen
+        return unlimited
 
-    unlimited: AnyPlant = at_each_step(drop_limits, plant)
-    return unlimited
+    without: AnyPlant = at_each_step(drop_limits, plant)
+    return without
 
 
 def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:

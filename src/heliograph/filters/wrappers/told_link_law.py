@@ -93,7 +93,8 @@ class ToldFilter(AbstractWrapper):
         filter, is_law = self._make_filter_given(numbers, k)
         after, innovation = filter.correct(state, values, k)
         # Numbers that give no law make the state NaN, so that the message is refused where it came in.
-        after = _spoil_state(after, ~is_law & ~jnp.all(jnp.isnan(values)))
+        is_message = ~jnp.all(jnp.isnan(values))
+        after = _spoil_state(after, ~is_law & is_message)
         return after, self._place_innovation(innovation)
 
     def expect(self, state: PyTree, k: Step = 0) -> Innovation:
@@ -103,7 +104,8 @@ class ToldFilter(AbstractWrapper):
         """
         # An expectation is minus the innovation of a measurement of zeros.
         filter = self.make(self.plant, at(self.sensor, k), believe_untold(at(self.link, k)))
-        return self._place_innovation(filter.correct(state, jnp.zeros(len(self.values)), k)[1])
+        _, innovation = filter.correct(state, jnp.zeros(len(self.values)), k)
+        return self._place_innovation(innovation)
 
     def draw_numbers(self, key: jax.Array, k: Step = 0) -> jax.Array:
         """Draw the numbers that a message tells at step k by their laws; raise ValueError where one has none."""
@@ -161,8 +163,8 @@ class ToldFilter(AbstractWrapper):
         if link.remembers:
             return False
         moments = second_order(link)
-        size = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
-        return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * size**2))
+        largest_gain = np.max(np.abs(np.asarray(moments.mean_gain)), initial=0.0)
+        return bool(np.all(np.abs(np.asarray(moments.gain_spread)) <= ROUNDING * largest_gain**2))
 
     def with_models(self, plant: AnyPlant, sensor: AnySensor, link: Channel) -> "ToldFilter":
         """Return the filter of another plant, sensor and link, told the same numbers; of the same claim.
@@ -184,13 +186,14 @@ class ToldFilter(AbstractWrapper):
         )
 
     def _split_message(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return values and numbers of a message; no value where a number is missing that it needs.
+        """Return values and numbers of a message; no value (NaN) where a number is missing that it needs.
 
-        Numbers tell the link's law. `_may_be_missing`: which of them are not needed (numbers,).
+        Numbers tell the link's law, on which each value depends as `list_told_numbers_of_outputs` says (values,
+        numbers). `_may_be_missing`: which numbers are not needed.
         """
         numbers = z[np.array(self.numbers)]
-        suffices = ~jnp.isnan(numbers) | self._may_be_missing
-        is_usable = jnp.all(suffices | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
+        is_known = ~jnp.isnan(numbers) | self._may_be_missing
+        is_usable = jnp.all(is_known | ~list_told_numbers_of_outputs(first(self.link)), axis=1)
         return jnp.where(is_usable, z[np.array(self.values)], jnp.nan), numbers
 
     @property
@@ -201,27 +204,25 @@ class ToldFilter(AbstractWrapper):
     def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
         """Build the filter of the link whose law these numbers give, and say whether they give one.
 
-        Where a number is missing that must not, it is that of a typical law.
+        A needed number that is missing is replaced by a typical one, so that the filter can be built.
         """
         link = at(self.link, k)
-        # A number that is missing although it is needed is replaced by a typical one, so that the filter can be built.
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
         complete = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
-        return self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete)), numbers_give_law(
-            link, complete
-        )
+        filter = self.make(self.plant, at(self.sensor, k), condition_on_told_numbers(link, complete))
+        return filter, numbers_give_law(link, complete)
 
 
-def _spoil_state(state: PyTree, spoilt: jax.Array) -> PyTree:
-    """Return a state with all its real numbers NaN where `spoilt`, else as it is.
+def _spoil_state(state: PyTree, is_refused: jax.Array) -> PyTree:
+    """Return a state with all its real numbers NaN where it `is_refused`, else as it is.
 
-    A NaN state says that the message gave no law of the link, so that it is refused.
+    A NaN state says that the message gave no law of the link.
     """
 
     def spoil(leaf: jax.Array) -> jax.Array:
-        """Return NaN in place of real numbers where the state is spoilt."""
+        """Return NaN in place of real numbers where the state is refused."""
         is_real = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
-        return jnp.where(spoilt, jnp.nan, leaf) if is_real else leaf
+        return jnp.where(is_refused, jnp.nan, leaf) if is_real else leaf
 
     return jax.tree.map(spoil, state)
 

@@ -190,7 +190,7 @@ class FrozenWeights(_NeighbourRule):
         """
         rows = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
-            choice = choose_code(_weigh_neighbours, (self.rule, *rows), (False, True, True))
+            choice = choose_code(_weigh_neighbours, (self.rule, *rows), differs_by_run=(False, True, True))
             if choice.code is None:
                 return None
             weights: Ahead = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), choice.results())

@@ -117,7 +117,7 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
     # Each point with each recording: points in the outer loop, recordings in the inner one.
     count, copies = len(data.measurements), (len(x), 1, 1)
     pairs = np.repeat(x, count, axis=0), *(np.tile(rows, copies) for rows in data_rows)
-    choice = choose_code(evaluate_recording, (objective, *pairs), [False, *(True for _ in pairs)])
+    choice = choose_code(evaluate_recording, (objective, *pairs), differs_by_run=[False, *(True for _ in pairs)])
     if choice.code is not None:
         results = choice.results()
     else:

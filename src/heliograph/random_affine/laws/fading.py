@@ -19,7 +19,8 @@ class Rayleigh(AbstractLaw):
     scale: Scalar
 
     def __init__(self, scale: "Float[ArrayLike, '']"):
-        self.scale = scalar("Rayleigh scale", scale, 0.0)
+        """Hold the standard deviation of the complex Gaussian's real part, which is its imaginary part's too."""
+        self.scale = scalar("Rayleigh scale", scale, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw scale * sqrt(-2 log u)."""
@@ -49,7 +50,8 @@ class Rician(AbstractLaw):
     scale: Scalar
 
     def __init__(self, sight: "Float[ArrayLike, '']", scale: "Float[ArrayLike, '']"):
-        self.sight = scalar("Rician line of sight", sight, 0.0)
+        """Hold the line of sight's amplitude and the standard deviation of the scatter's real and imaginary part."""
+        self.sight = scalar("Rician line of sight", sight, low=0.0)
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -86,19 +88,19 @@ def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
     """Return the Laguerre function L_v(-x) = 1F1(-v; 1; -x) of order v = `twice_order` / 2 >= 0 at -x <= 0.
 
     By (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1). Whole orders are polynomials, from L_0 = 1. The others start
-    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) =
-    e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. Below: `before` is
-    L_(v-1), `now` L_v.
+    from exponentially scaled Bessel functions, L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x)
+    I_0(x/2) + x I_1(x/2)). L grows with v, so the difference loses no digits. `previous` is L_(v-1), `current` L_v.
     """
     if twice_order % 2:
         bessel = scipy_for(x).special
-        before = bessel.i0e(x / 2)
-        now, v = (1 + x) * before + x * bessel.i1e(x / 2), 0.5
+        previous = bessel.i0e(x / 2)
+        current, v = (1 + x) * previous + x * bessel.i1e(x / 2), 0.5
     else:
-        before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
+        previous, current, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
     while v < twice_order / 2:
-        before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
-    moment: Scalar = now
+        next_value = ((2 * v + 1 + x) * current - v * previous) / (v + 1)
+        previous, current, v = current, next_value, v + 1
+    moment: Scalar = current
     return moment
 
 
@@ -109,8 +111,9 @@ class Nakagami(AbstractLaw):
     power: Scalar
 
     def __init__(self, shape: "Float[ArrayLike, '']", power: "Float[ArrayLike, '']" = 1.0):
-        self.shape = scalar("Nakagami shape", shape, 0.5)
-        self.power = scalar("Nakagami power", power, 0.0)
+        """Hold the shape m, at least 1/2, and the mean power E[g^2]."""
+        self.shape = scalar("Nakagami shape", shape, low=0.5)
+        self.power = scalar("Nakagami power", power, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw the root of a gamma variable with shape m and mean `power`."""
@@ -124,9 +127,9 @@ class Nakagami(AbstractLaw):
 
     def quantile(self, probability: Vector) -> np.ndarray:
         """Return the gains below which the law has these probabilities: roots of the quantiles of g^2, a gamma law."""
-        return np.asarray(
-            np.sqrt(scipy.special.gammaincinv(float(self.shape), probability) * float(self.power) / float(self.shape))
-        )
+        m, power = float(self.shape), float(self.power)
+        squares = scipy.special.gammaincinv(m, probability) * power / m
+        return np.asarray(np.sqrt(squares))
 
     def log_density(self, g: jax.Array) -> jax.Array:
         """Return (2 m - 1) log(g) - m g^2 / power."""
@@ -150,8 +153,9 @@ class LogNormal(AbstractLaw):
     log_deviation: Scalar
 
     def __init__(self, log_mean: "Float[ArrayLike, '']", log_deviation: "Float[ArrayLike, '']"):
+        """Hold mean and standard deviation of log g."""
         self.log_mean = scalar("log-normal mean", log_mean)
-        self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
+        self.log_deviation = scalar("log-normal deviation", log_deviation, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw exp(log_mean + log_deviation n)."""

@@ -106,8 +106,8 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
         The gain is g = e^t of a `logarithmic` law, else t^4; `deviation`: of e.
         """
         g = to_gain(t)
-        stretch = t if law.logarithmic else 3 * jnp.log(t)  # log dg/dt, but for a constant
-        return law.log_density(g) + stretch - jnp.square((a - g) / deviation) / 2
+        log_slope = t if law.logarithmic else 3 * jnp.log(t)  # of g by t, but for a constant
+        return law.log_density(g) + log_slope - jnp.square((a - g) / deviation) / 2
 
     # All gains that may count: those of the law, those near the reading, and all between.
     low, high = law.bulk()
@@ -116,7 +116,7 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     # The part of these that does count: within NATS of the mode.
     mode = _find_density_mode(log_density, low, high)
     least = log_density(mode) - NATS
-    left, right = _find_density_end(log_density, low, mode, least), _find_density_end(log_density, high, mode, least)
+    left, right = _find_density_edge(log_density, low, mode, least), _find_density_edge(log_density, high, mode, least)
     # Weights p(t | a) dt at the nodes, normalised; the variance about the mean, so that nothing cancels.
     x, w = np.polynomial.legendre.leggauss(NODES)
     t = (left + right) / 2 + (right - left) / 2 * x
@@ -141,11 +141,11 @@ def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array)
         return points[jnp.maximum(best - 1, 0)], points[jnp.minimum(best + 1, GRID - 1)]
 
     left, right = jax.lax.fori_loop(0, ZOOMS, zoom, (low, high))
-    middle: jax.Array = (left + right) / 2
-    return middle
+    mode: jax.Array = (left + right) / 2
+    return mode
 
 
-def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
+def _find_density_edge(log_density: LogDensity, outer: jax.Array, mode: jax.Array, least: jax.Array) -> jax.Array:
     """Return a place near the one where the density rises above `least`, on its side towards `outer`.
 
     Args:
@@ -164,8 +164,8 @@ def _find_density_end(log_density: LogDensity, outer: jax.Array, mode: jax.Array
         outside, inside = ends
         points = outside + (inside - outside) * steps
         is_above = (jax.vmap(log_density)(points) > least).at[-1].set(True)
-        first = jnp.argmax(is_above)  # the first that is
-        return points[jnp.maximum(first - 1, 0)], points[first]
+        first_above = jnp.argmax(is_above)
+        return points[jnp.maximum(first_above - 1, 0)], points[first_above]
 
     outside: jax.Array = jax.lax.fori_loop(0, ZOOMS // 2, zoom, (outer, mode))[0]
     return outside
@@ -210,6 +210,7 @@ def reading_quadrature(
         variance: of e, positive.
     """
     gains, weights = gain_quadrature(law)
-    x, w = np.polynomial.hermite_e.hermegauss(ERRORS)
-    readings = gains + np.sqrt(variance) * x
-    return readings.reshape(-1, 1), np.outer(weights, w / w.sum()).ravel()
+    nodes, node_weights = np.polynomial.hermite_e.hermegauss(ERRORS)  # of a standard normal error
+    readings = gains + np.sqrt(variance) * nodes
+    joint_weights = np.outer(weights, node_weights / node_weights.sum())
+    return readings.reshape(-1, 1), joint_weights.ravel()

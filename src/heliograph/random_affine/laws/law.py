@@ -118,6 +118,7 @@ class Constant(AbstractLaw):
     value: Scalar
 
     def __init__(self, value: "Float[ArrayLike, '']"):
+        """Hold the value that the gain has with probability 1."""
         self.value = scalar("constant gain", value)
 
     @property
@@ -146,6 +147,7 @@ class Discrete(AbstractLaw):
     radius: np.ndarray
 
     def __init__(self, values: ArrayLike, probabilities: ArrayLike, radius: ArrayLike = 0.0):
+        """Hold the possible gains, their probabilities, and how far each probability may be off (`radius`)."""
         self.values = array("gain values", values, (None,))
         self.probabilities = check.probabilities("gain probabilities", probabilities, len(self.values))
         self.radius = radii("probability radius", radius, self.probabilities)
@@ -185,10 +187,11 @@ class Discrete(AbstractLaw):
         gain = array("payoff", payoff, self.values.shape)
         low = np.maximum(self.probabilities - self.radius, 0.0)
         high = np.minimum(self.probabilities + self.radius, 1.0)
-        mass, total = 1.0 - low.sum(), float(low @ gain)
-        for i in np.argsort(-gain, kind="stable"):
-            added = min(mass, high[i] - low[i])
-            total, mass = total + added * gain[i], mass - added
+        mass_left, total = 1.0 - low.sum(), float(low @ gain)
+        largest_first = np.argsort(-gain, kind="stable")
+        for i in largest_first:
+            added = min(mass_left, high[i] - low[i])
+            total, mass_left = total + added * gain[i], mass_left - added
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
@@ -244,6 +247,7 @@ class CertainDiscrete(Discrete):
     """
 
     def __init__(self, law: Discrete):
+        """Take values and probabilities from `law`, whose probabilities must have no radius of uncertainty."""
         if np.any(law.radius > 0):
             raise fail("probabilities of a gain", "known ones, beside what a message tells", "uncertain ones")
         self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
@@ -263,7 +267,7 @@ def bernoulli(probability: "Float[ArrayLike, '']", radius: "Float[ArrayLike, '']
     Raises:
         ValueError: a probability outside [0, 1], or a radius that it does not allow.
     """
-    p = scalar("probability that a link works", probability, 0.0, 1.0)
+    p = scalar("probability that a link works", probability, low=0.0, high=1.0)
     return Discrete([0.0, 1.0], [1 - p, p], radius)
 
 
@@ -283,6 +287,7 @@ class GivenMoments(AbstractLaw):
     moments: Vector
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
+        """Hold E[g], E[g^2], ..., refused unless their Hankel matrix is that of some distribution."""
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return
@@ -290,8 +295,8 @@ class GivenMoments(AbstractLaw):
         half = (len(sequence) - 1) // 2
         # Moments of a distribution have a positive semidefinite Hankel matrix E[V V'], V = (1, g, g^2, ...).
         hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
-        scale = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
-        smallest = np.linalg.eigvalsh(hankel / np.outer(scale, scale))[0]
+        root_of_diagonal = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
+        smallest = np.linalg.eigvalsh(hankel / np.outer(root_of_diagonal, root_of_diagonal))[0]
         if np.any(np.diag(hankel) < 0) or smallest < -1e-10:  # rounding of a correlation matrix
             raise fail("gain moments", "those of some distribution", f"{self.moments.tolist()}, which none has")
 

@@ -27,6 +27,7 @@ from .monomials import evaluate_monomials as evaluate_monomials
 from .monomials import factor_variables as factor_variables
 from .monomials import give_moments as give_moments
 from .monomials import list_exponents as list_exponents
+from .monomials import multiply_by_linear_form as multiply_by_linear_form
 from .monomials import multiply_polynomials as multiply_polynomials
 from .monomials import place_monomials as place_monomials
 from .monomials import plan_binomial_sums as plan_binomial_sums

@@ -41,11 +41,15 @@ class DisturbedGain(NamedTuple):
         Shapes: (rank, m, c).
         """
         m, c = self.mean.shape
-        size = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
-        unit = np.where(size > 0, size, 1.0)  # each entry in units of its own: rounding is relative to these
+        root_moments = np.sqrt(np.diagonal(self.second.reshape(m * c, m * c)))
+        unit = np.where(
+            root_moments > 0, root_moments, 1.0
+        )  # each entry in units of its own: rounding is relative to these
         values, vectors = np.linalg.eigh(self.covariance.reshape(m * c, m * c) / np.outer(unit, unit))
-        used = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
-        factors: np.ndarray = (unit[:, None] * np.sqrt(values[used]) * vectors[:, used]).T.reshape(-1, m, c)
+        is_positive = values > ROUNDING * max(1.0, float(np.max(values, initial=0.0)))
+        factors: np.ndarray = (unit[:, None] * np.sqrt(values[is_positive]) * vectors[:, is_positive]).T.reshape(
+            -1, m, c
+        )
         return factors
 
     def then(self, other: "DisturbedGain") -> "DisturbedGain":
@@ -54,9 +58,8 @@ class DisturbedGain(NamedTuple):
         G takes the signal, N the disturbances; those of the other map, as many as I is long, are passed on.
         """
         identity = np.eye(other.disturbances)
-        passed = stack_on_shared_inputs(
-            [self, DisturbedGain(identity, np.multiply.outer(identity, identity), 0)], shared=0
-        )
+        passed_on = DisturbedGain(identity, np.multiply.outer(identity, identity), inputs=0)
+        passed = stack_on_shared_inputs([self, passed_on], shared=0)
         second = np.einsum("aicj,ibjd->abcd", other.second, passed.second)
         return DisturbedGain(other.mean @ passed.mean, second, self.inputs)
 
@@ -71,12 +74,13 @@ def noise_gain(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m
     """
     unit = standard_deviations(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))  # of correlations: free of units
-    used = values > ROUNDING * np.max(values, initial=0.0)
-    root: np.ndarray = unit[:, None] * np.sqrt(values[used]) * vectors[:, used]
+    is_positive = values > ROUNDING * np.max(values, initial=0.0)
+    root: np.ndarray = unit[:, None] * np.sqrt(values[is_positive]) * vectors[:, is_positive]
     root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
     scaled = mean / unit
-    missed = scaled - vectors[:, used] @ (vectors[:, used].T @ scaled)
-    if np.any(np.abs(missed) > SYMMETRY_TOLERANCE * np.abs(scaled).max()):
+    basis = vectors[:, is_positive]
+    residual = scaled - basis @ (basis.T @ scaled)
+    if np.any(np.abs(residual) > SYMMETRY_TOLERANCE * np.abs(scaled).max()):
         raise fail("noise of an H-infinity design", "a mean that its covariance can make", mean.tolist())
     return root
 
@@ -88,21 +92,22 @@ def disturb_hop(gain: np.ndarray, moments: tuple[float, float], root: np.ndarray
     """
     scaled = np.concatenate([gain, np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(gain), root], axis=1)
-    first, second = moments
+    mean_gain, mean_square_gain = moments
     outer = np.multiply.outer
-    cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
-    mean = first * scaled + fixed
-    return DisturbedGain(mean, second * outer(scaled, scaled) + cross + outer(fixed, fixed), gain.shape[1])
+    cross = mean_gain * (outer(scaled, fixed) + outer(fixed, scaled))
+    mean = mean_gain * scaled + fixed
+    joint_second = mean_square_gain * outer(scaled, scaled) + cross + outer(fixed, fixed)
+    return DisturbedGain(mean, joint_second, gain.shape[1])
 
 
-def mix_gains(parts: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
-    """Return the moments of a map drawn from `parts` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
+def mix_gains(gains: Sequence[DisturbedGain], weights: Float[np.ndarray, " parts"], inputs: int) -> DisturbedGain:
+    """Return the moments of a map drawn from `gains` with `weights`: sum_i w_i E_i and sum_i w_i E_i[H_ab H_ij].
 
     The first `inputs` columns of H take the signal; the noises of each part stand behind, in columns of their own.
     """
-    widened = [_place_columns(gain, inputs, parts, i) for i, gain in enumerate(parts)]
-    mean = np.tensordot(weights, [gain.mean for gain in widened], axes=1)
-    second = np.tensordot(weights, [gain.second for gain in widened], axes=1)
+    in_joint_columns = [_place_columns(gain, inputs, gains, i) for i, gain in enumerate(gains)]
+    mean = np.tensordot(weights, [gain.mean for gain in in_joint_columns], axes=1)
+    second = np.tensordot(weights, [gain.second for gain in in_joint_columns], axes=1)
     return DisturbedGain(mean, second, inputs)
 
 
@@ -111,7 +116,7 @@ def _place_columns(gain: DisturbedGain, shared: int, parts: Sequence[DisturbedGa
 
     `index`: which of the parts the map is; in the columns of the others it is zero.
     """
-    private_widths = [p.mean.shape[1] - shared for p in parts]
+    private_widths = [part.mean.shape[1] - shared for part in parts]
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
     m, total = gain.mean.shape[0], shared + sum(private_widths)

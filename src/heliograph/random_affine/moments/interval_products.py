@@ -18,10 +18,12 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
 
     By centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1).
     """
-    c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
-    c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
-    size = library(c1, c2).abs
-    center, radius = c2 @ c1, size(c2) @ r1 + r2 @ (size(c1) + r1)
+    low1, high1 = first
+    low2, high2 = second
+    c2, r2 = (high2 + low2) / 2, (high2 - low2) / 2
+    c1, r1 = (high1 + low1) / 2, (high1 - low1) / 2
+    absolute = library(c1, c2).abs
+    center, radius = c2 @ c1, absolute(c2) @ r1 + r2 @ (absolute(c1) + r1)
     return center - radius, center + radius
 
 
@@ -35,6 +37,6 @@ def multiply_interval_polynomials(a: Entries, first: int, b: Entries, second: in
     table = product_table(variables, first, second)
     size = (count_monomials(variables, first + second),)
     products = a.reshape(-1, 1, a.shape[-1], 1) * b.reshape(1, -1, 1, b.shape[-1])
-    return stack_parts(
-        [scatter(size, table, products.min(axis=(0, 1))), scatter(size, table, products.max(axis=(0, 1)))]
-    )
+    lowest = scatter(size, table, products.min(axis=(0, 1)))
+    highest = scatter(size, table, products.max(axis=(0, 1)))
+    return stack_parts([lowest, highest])

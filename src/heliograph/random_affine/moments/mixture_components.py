@@ -34,16 +34,15 @@ class AffineComponent(NamedTuple):
         c are offsets and n noises, given by their covariances; the probability of both is the product of the weights.
         """
         weight, gain, offset, noise = other
-        spread = gain @ self.noise @ gain.T + noise
-        return AffineComponent(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, spread)
+        covariance = gain @ self.noise @ gain.T + noise
+        return AffineComponent(self.weight * weight, gain @ self.gain, gain @ self.offset + offset, covariance)
 
     def above(self, other: "AffineComponent") -> "AffineComponent":
         """Return this map above an independent one of the same input: with the product of their probabilities."""
-        gain, offset = (
-            _concatenate_first_axis(self.gain, other.gain),
-            _concatenate_first_axis(self.offset, other.offset),
-        )
-        return AffineComponent(self.weight * other.weight, gain, offset, block_diagonal([self.noise, other.noise]))
+        gain = _concatenate_first_axis(self.gain, other.gain)
+        offset = _concatenate_first_axis(self.offset, other.offset)
+        noise = block_diagonal([self.noise, other.noise])
+        return AffineComponent(self.weight * other.weight, gain, offset, noise)
 
 
 class NoiseAtom(NamedTuple):
@@ -62,7 +61,7 @@ class NoiseAtom(NamedTuple):
         return NoiseAtom(self.weight * other.weight, value, block_diagonal([self.covariance, other.covariance]))
 
 
-def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
+def combine_atoms(atoms_by_part: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom]) -> list[Atom]:
     """Return every atom (a possible value with its probability) of each independent part, joined with all others'.
 
     Raises:
@@ -75,7 +74,7 @@ def combine_atoms(parts: Sequence[list[Atom]], join: Callable[[Atom, Atom], Atom
             raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
         return [join(x, y) for x in a for y in b]
 
-    return reduce(pairs, parts)
+    return reduce(pairs, atoms_by_part)
 
 
 def _concatenate_first_axis(a: Array, b: Array) -> Array:
@@ -107,13 +106,13 @@ def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
 
     A branch is a Gaussian law of which a component is a mixture; those that are added have the probability 0.
     """
-    xp, most = library(parts), max(law.mean.shape[1] for law in parts)
-    fills = (-np.inf, 0.0, 1.0)  # of the logarithm of the probability, the mean and the variance
+    xp, largest_count = library(parts), max(law.mean.shape[1] for law in parts)
+    padding_values = (-np.inf, 0.0, 1.0)  # of the logarithm of the probability, the mean and the variance
 
     def padded(law: GaussianBranches) -> list[Array]:
         """Return the arrays of a law with branches of no probability, up to the largest number."""
-        more = ((0, 0), (0, most - law.mean.shape[1]))
-        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, fills, strict=True)]
+        more = ((0, 0), (0, largest_count - law.mean.shape[1]))
+        return [xp.pad(value, more, constant_values=fill) for value, fill in zip(law, padding_values, strict=True)]
 
     return GaussianBranches(*(xp.concatenate(rows) for rows in zip(*map(padded, parts), strict=True)))
 

@@ -18,6 +18,6 @@ def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
 
 def drop_constant(tensor: Tensor) -> Tensor:
     """Return the tensor with zeros in the last row and column of its last two axes, those of the constant 1."""
-    signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
-    signal_part: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
+    is_signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
+    signal_part: Tensor = library(tensor).where(is_signal[:, None] & is_signal, tensor, 0.0)
     return signal_part

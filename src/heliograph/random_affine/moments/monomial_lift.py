@@ -35,6 +35,7 @@ class Lift(AbstractMapWrapper):
     degree: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
+        """Hold the map `base`, which must not erase, and the highest degree of the monomials."""
         check_count("degree of the lift", degree)
         (base,) = check_maps("lift", [base])
         if base.erases:
@@ -68,7 +69,8 @@ class Lift(AbstractMapWrapper):
         columns = _find_product_positions(self.base.inputs + 1, self.degree, order)
         refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
         repetitions = np.bincount(columns)
-        return JointMoments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
+        matrix = inner[rows][:, columns] / repetitions[columns]
+        return JointMoments(matrix, self.outputs, self.inputs, order)
 
     def degree_in(self, identity: str) -> int:
         """Return `degree` times that of the map."""
@@ -85,12 +87,11 @@ def _find_product_positions(variables: int, degree: int, order: int) -> np.ndarr
 
     The products are listed as `list_exponents` lists the powers of the monomials of `degree`.
     """
-    parts = list_exponents(variables, degree)
-    target = position(variables, degree * order)
-    return np.array([
-        target[tuple(sum(power * parts[i][v] for i, power in enumerate(powers) if power) for v in range(variables))]
-        for powers in list_exponents(len(parts), order)
-    ])  # fmt: skip
+    factors = list_exponents(variables, degree)
+    position_of_product = position(variables, degree * order)
+    exponents = np.array(factors)  # (factor, variable)
+    products = [powers @ exponents for powers in np.array(list_exponents(len(factors), order))]
+    return np.array([position_of_product[tuple(product.tolist())] for product in products])
 
 
 def square(base: AbstractRandomAffine) -> Lift:

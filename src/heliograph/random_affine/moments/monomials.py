@@ -17,7 +17,7 @@ import numpy as np
 from heliograph.numerics.caching import cache_arrays
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import scatter
+from heliograph.numerics.numpy_or_jax import is_zero, plain, scatter
 from heliograph.numerics.types import Float
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
@@ -59,8 +59,8 @@ def factor_variables(variables: int, degree: int) -> np.ndarray:
     Monomials, and variables in each, in the order of `list_exponents`.
     """
     choices = combinations_with_replacement(range(variables), degree)
-    flat = np.fromiter((variable for choice in choices for variable in choice), np.int64)
-    return flat.reshape(count_monomials(variables, degree), degree)
+    all_variables = np.fromiter((variable for choice in choices for variable in choice), np.int64)
+    return all_variables.reshape(count_monomials(variables, degree), degree)
 
 
 def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
@@ -70,13 +70,13 @@ def place_monomials(chosen: np.ndarray, variables: int) -> np.ndarray:
     same variables before the t-th, and a smaller t-th.
     """
     ordered = np.sort(chosen, axis=-1)
-    before = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
+    previous = np.concatenate([np.zeros_like(ordered[..., :1]), ordered], axis=-1)
     rank = np.zeros(chosen.shape[:-1], dtype=np.int64)
     for t in range(chosen.shape[-1]):
-        # counts[n]: monomials of the `rest` variables from the t-th on among the last n variables.
-        rest = chosen.shape[-1] - t
-        counts = np.array([count_monomials(n, rest) for n in range(variables + 1)])
-        rank += counts[variables - before[..., t]] - counts[variables - before[..., t + 1]]
+        # counts[n]: monomials that the variables from the t-th on can be, among the last n variables.
+        variables_left = chosen.shape[-1] - t
+        counts = np.array([count_monomials(n, variables_left) for n in range(variables + 1)])
+        rank += counts[variables - previous[..., t]] - counts[variables - previous[..., t + 1]]
     return rank
 
 
@@ -93,13 +93,15 @@ def evaluate_monomials(y: Numbers, degree: int) -> Numbers:
     NumPy's where y is, else JAX's.
     """
     values: list[Numbers] = [*y, 1.0]
-    terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
-             for powers in list_exponents(len(values), degree)]  # fmt: skip
+    terms = []
+    for powers in list_exponents(len(values), degree):
+        factors = (value**power for value, power in zip(values, powers, strict=True) if power)
+        terms.append(prod(factors, start=1.0))
     if isinstance(y, np.ndarray):
         return np.array(terms, dtype=np.float64)
     import jax.numpy as jnp
 
-    return jnp.stack([jnp.asarray(t, dtype=float) for t in terms])
+    return jnp.stack([jnp.asarray(term, dtype=float) for term in terms])
 
 
 @cache_arrays
@@ -121,9 +123,8 @@ def _tabulate_quotient_positions(variables: int, degree: int) -> np.ndarray:
 def _find_dividing_variable(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each monomial the last variable that divides it, and the quotient's position at degree - 1."""
     table = _tabulate_quotient_positions(variables, degree)
-    divisor = np.array(
-        [max(c for c, power in enumerate(powers) if power) for powers in list_exponents(variables, degree)]
-    )
+    exponents = list_exponents(variables, degree)
+    divisor = np.array([max(c for c, power in enumerate(powers) if power) for powers in exponents])
     return divisor, table[np.arange(len(divisor)), divisor]
 
 
@@ -163,14 +164,26 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
     """
     a, b = factor_variables(variables, first), factor_variables(variables, second)
     shape = len(a), len(b)
-    both = [np.broadcast_to(a[:, None], (*shape, first)), np.broadcast_to(b, (*shape, second))]
-    return place_monomials(np.concatenate(both, axis=-1), variables)
+    of_a = np.broadcast_to(a[:, None], (*shape, first))
+    of_b = np.broadcast_to(b, (*shape, second))
+    return place_monomials(np.concatenate([of_a, of_b], axis=-1), variables)
 
 
 def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
     """Multiply two homogeneous polynomials given by coefficients."""
     terms = a[:, None] * b
     return scatter((count_monomials(variables, first + second),), product_table(variables, first, second), terms)
+
+
+def multiply_by_linear_form(polynomial: dict[Exponents, Numbers], row: Numbers) -> dict[Exponents, Numbers]:
+    """Return the coefficients, by exponents of u, of the polynomial p(u) times sum_j row_j u_j."""
+    product: dict[Exponents, Numbers] = {}
+    nonzero = [j for j, entry in enumerate(row) if not is_zero(entry)]
+    for a, coefficient in polynomial.items():
+        for j in nonzero:
+            exponents_times_u_j = (*a[:j], a[j] + 1, *a[j + 1 :])
+            product[exponents_times_u_j] = product.get(exponents_times_u_j, 0.0) + coefficient * plain(row[j])
+    return product
 
 
 @cache_arrays
@@ -186,15 +199,16 @@ def plan_binomial_sums(dimension: int, order: int) -> tuple[np.ndarray, np.ndarr
     For all monomials a of (y, 1) of this order, y of `dimension`. Places are among these: b and a - b are times powers
     of 1.
     """
-    places, terms = position(dimension + 1, order), []
+    position_of, terms = position(dimension + 1, order), []
     for row, powers in enumerate(list_exponents(dimension + 1, order)):
         a = powers[:-1]
         for b in product(*(range(x + 1) for x in a)):
-            rest = tuple(x - y for x, y in zip(a, b, strict=True))
+            remainder = tuple(x - y for x, y in zip(a, b, strict=True))
             weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
-            terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
-    rows, columns, noises, weights = np.array(terms, dtype=np.int64).T
-    return rows, columns, noises, weights
+            column = position_of[(*b, order - sum(b))]
+            terms.append((row, column, position_of[(*remainder, order - sum(remainder))], weight))
+    rows, columns, remainders, weights = np.array(terms, dtype=np.int64).T
+    return rows, columns, remainders, weights
 
 
 class JointMoments(Module):
@@ -220,16 +234,16 @@ class JointMoments(Module):
     def second(self) -> Float[jax.Array | np.ndarray, "m m p+1 p+1"]:
         """T of E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, Y = (y, 1), symmetric in (i, j) and (a, b); order 2."""
         # Where the monomials z_i z_j and Y_a Y_b stand in the matrix.
-        rows = product_table(self.outputs + 1, 1, 1)[:-1, :-1]
-        columns = product_table(self.inputs + 1, 1, 1)
+        rows = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
+        columns = product_table(self.inputs + 1, first=1, second=1)
         shares = np.where(np.eye(self.inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b is at (a, b) and (b, a)
         tensor: jax.Array | np.ndarray = self.matrix[rows[:, :, None, None], columns] / shares
         return tensor
 
     def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
         """Return E[Sym^order(H)] of a lower order: times powers of 1, its monomials are among those of `self.order`."""
-        places = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
-        matrix: jax.Array | np.ndarray = self.matrix[places]
+        positions = _place_lower_monomials(self.outputs, self.inputs, self.order, order)
+        matrix: jax.Array | np.ndarray = self.matrix[positions]
         return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
@@ -250,17 +264,17 @@ def times_one(variables: int, low: int, high: int) -> np.ndarray:
     return place_monomials(np.pad(chosen, ((0, 0), (0, high - low)), constant_values=variables - 1), variables)
 
 
-def give_moments(written: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
-    """Return a map's method `moments` (`written`), which may give a matrix alone, as one that gives `JointMoments`.
+def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], JointMoments]:
+    """Return a map's method `moments` (`own_method`), which may give a matrix alone, as one that gives `JointMoments`.
 
     Raises:
         ValueError: a matrix whose shape is not that of the map's monomials.
     """
 
-    @wraps(written)
+    @wraps(own_method)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from what the map's own method, `written`, returns: they or a matrix."""
-        result = written(channel, order)
+        """Return the moments of this order, from what the map's own method returns: they or a matrix."""
+        result = own_method(channel, order)
         if isinstance(result, JointMoments):
             return result
         shape = count_monomials(channel.outputs + 1, order), count_monomials(channel.inputs + 1, order)

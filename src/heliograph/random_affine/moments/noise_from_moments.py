@@ -48,6 +48,7 @@ class NoiseMoments(AbstractNoise):
     covariance: Square
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
+        """Hold E[n], E[n^2], ..., refused unless some distribution has them; mean and variance follow."""
         self.moments = array("noise moments", moments, (None,))
         if len(self.moments) < 2:
             raise fail("noise moments", "at least E[n] and E[n^2]", f"{len(self.moments)} of them")
@@ -152,6 +153,7 @@ class CentredNoise(AbstractNoise):
     covariance: Square
 
     def __init__(self, source: AbstractNoise):
+        """Hold the law of n; n - E[n] has mean 0 and the same covariance."""
         self.source, self.covariance = source, source.covariance
         self.mean = np.zeros(source.dimension)
 
@@ -166,11 +168,11 @@ class CentredNoise(AbstractNoise):
         """
         total: Number = 0.0
         for b in product(*(range(a + 1) for a in powers)):
-            weights = [
+            factors = [
                 comb(a_i, b_i) * plain((-self.source.mean[i]) ** (a_i - b_i))
                 for i, (a_i, b_i) in enumerate(zip(powers, b, strict=True))
             ]
-            total += prod(weights) * (self.source.moment(b) if any(b) else 1.0)
+            total += prod(factors) * (self.source.moment(b) if any(b) else 1.0)
         return total
 
 

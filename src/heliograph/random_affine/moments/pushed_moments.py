@@ -52,10 +52,11 @@ def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Arr
 
     E[z^a] = sum_{b <= a} C(a, b) E[n^(a-b)] E[g^|b|] E[(A y)^b].
     """
-    known = push_through_known_map(affine_matrix(channel.matrix), order, _read_moments(channel, order, moments))
-    scaled = known * tabulate_gain_moments(channel.law, order)[degrees(channel.outputs, order)]
-    row, column, noise, weight = plan_binomial_sums(channel.outputs, order)
-    terms = weight * noise_moment_vector(channel.noise, order)[noise] * scaled[column]
+    of_known_map = push_through_known_map(affine_matrix(channel.matrix), order, _read_moments(channel, order, moments))
+    scaled = of_known_map * tabulate_gain_moments(channel.law, order)[degrees(channel.outputs, order)]
+    row, column, remainder, binomial = plan_binomial_sums(channel.outputs, order)
+    noise_moments = noise_moment_vector(channel.noise, order)
+    terms = binomial * noise_moments[remainder] * scaled[column]
     if is_traced(terms):
         return jnp.bincount(row, terms, length=len(scaled))
     return np.bincount(row, np.asarray(terms), minlength=len(scaled))
@@ -81,15 +82,15 @@ def push_through_known_map(homogeneous: Array2, order: int, moments: Array1) -> 
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """
-    propagated: Array1
+    mapped: Array1
     if order % 2:
-        propagated = symmetric_power(homogeneous, order) @ moments
-        return propagated
+        mapped = symmetric_power(homogeneous, order) @ moments
+        return mapped
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
-    second = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
-    propagated = second.reshape(-1)[_choose_product_places(outputs, order // 2)]
-    return propagated
+    mapped_products = lifted @ products_of_monomials(moments, inputs, order // 2) @ lifted.T
+    mapped = mapped_products.reshape(-1)[_choose_product_places(outputs, order // 2)]
+    return mapped
 
 
 class TabulatedNoise(AbstractNoise):
@@ -102,6 +103,7 @@ class TabulatedNoise(AbstractNoise):
     order: int = eqx.field(static=True)
 
     def __init__(self, source: AbstractNoise, order: int):
+        """Compute the table of the noise's moments up to `order`; `source` is the noise itself."""
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
         self.table, self.order = noise_moment_vector(source, order), order
 
@@ -154,6 +156,6 @@ def _choose_product_places(variables: int, degree: int) -> np.ndarray:
     Of several products that give the same monomial, the last.
     """
     table = product_table(variables, degree, degree).reshape(-1)
-    places = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
-    places[table] = np.arange(table.size)
-    return places
+    product_positions = np.zeros(count_monomials(variables, 2 * degree), dtype=np.int64)
+    product_positions[table] = np.arange(table.size)
+    return product_positions

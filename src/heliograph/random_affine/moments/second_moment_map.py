@@ -32,11 +32,12 @@ class QuadraticMap(Module):
         The entries are within radius : |W| of center : W; their row sums on the diagonal dominate any such difference
         (Gershgorin), in a unit of each component's own. Rows and columns of components not `present` are zero.
         """
-        mask = present[:, None] & present[None, :]
+        both_present = present[:, None] & present[None, :]
         center = self.evaluate_center(second_moment, present)
-        entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        unit = jnp.sqrt(_one_unless_positive(jnp.abs(jnp.diagonal(center)) + jnp.diagonal(entries)))
-        return center + jnp.diag(unit * jnp.sum(entries / unit, axis=1))
+        radius = jnp.where(both_present, contract(self.radius, jnp.abs(second_moment)), 0.0)
+        largest_variance = jnp.abs(jnp.diagonal(center)) + jnp.diagonal(radius)
+        unit = jnp.sqrt(_one_unless_positive(largest_variance))
+        return center + jnp.diag(unit * jnp.sum(radius / unit, axis=1))
 
     def evaluate_center(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Return C:W alone, which is all where the law is known."""
@@ -78,7 +79,9 @@ def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> Quadrati
     """Return the map of a block of outputs as one of all `outputs`: the block from `start` on, zero elsewhere."""
     margin = (start, outputs - start - block.center.shape[0])
     widths = [margin, margin, (0, 0), (0, 0)]
-    return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
+    center = library(block.center).pad(block.center, widths)
+    radius = library(block.radius).pad(block.radius, widths)
+    return QuadraticMap(center, radius)
 
 
 def stop_gradient(value: Matrix) -> Matrix:

@@ -84,11 +84,12 @@ def split_off_noise(spread: Tensor) -> tuple[Tensor, WeightedColumns]:
     """
     xp, covariance = library(spread), spread[..., -1, -1]
     uncorrelated = xp.all(spread[..., :-1, -1] == 0)
-    corner = np.zeros(spread.shape[-2:])
-    corner[-1, -1] = 1.0
-    # `corner` is where a spread has the covariance of n. Of the m columns some are zero if the covariance has fewer.
-    noise = _pad_columns(columns_of(xp.where(uncorrelated, covariance, 0.0)))
-    return spread - xp.where(uncorrelated, covariance, 0.0)[..., None, None] * corner, noise
+    at_noise = np.zeros(spread.shape[-2:])
+    at_noise[-1, -1] = 1.0
+    # `at_noise` is 1 where a spread has the covariance of n.
+    split = xp.where(uncorrelated, covariance, 0.0)
+    noise = _pad_columns(columns_of(split))  # m columns, some of them zero if the covariance has fewer
+    return spread - split[..., None, None] * at_noise, noise
 
 
 def _pad_columns(noise: WeightedColumns) -> WeightedColumns:
@@ -104,10 +105,8 @@ def join_gain_and_noise(gain: Tensor, noise: WeightedColumns) -> Tensor:
     """
     xp = library(gain, noise)
     covariance = (noise.matrix * noise.weights[..., None, :]) @ xp.swapaxes(noise.matrix, -1, -2)
-    corner = np.zeros(gain.shape[-2:])
-    corner[-1, -1] = 1.0
-    whole: Tensor = gain + covariance[..., None, None] * corner
-    return whole
+    joint: Tensor = gain + covariance[..., None, None] * _make_power_of_constant(gain.shape[-1])
+    return joint
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
@@ -125,8 +124,9 @@ def has_known_mean(described: SecondOrder) -> bool:
     """Return whether E[G] and E[n] are the same under every possible law, to rounding; False for traced parameters."""
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
-    # Squared, as the shift is: a second moment of the mean's difference from the nominal one.
-    size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
+    largest_gain = np.max(np.abs(described.mean_gain), initial=0.0)
+    largest_offset = np.max(np.abs(described.offset), initial=0.0)
+    size = largest_gain**2 + largest_offset**2  # squared, as the shift of the mean is: a second moment
     largest = max(np.max(np.abs(bound), initial=0.0) for bound in (described.shift.center, described.shift.radius))
     return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
 
@@ -186,9 +186,8 @@ def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     # A single corner: nothing is uncertain.
     if corners == 1:
         return _take_known_moments(channel)
-    can_list_corners = (
-        corners is not None and corners <= CORNERS and corners * (channel.inputs + 1) ** 2 <= MEMORY_LIMIT_ENTRIES
-    )
+    entries = (channel.inputs + 1) ** 2
+    can_list_corners = corners is not None and corners <= CORNERS and corners * entries <= MEMORY_LIMIT_ENTRIES
     return _bound_uncertain_moments(channel, can_list_corners)
 
 
@@ -249,10 +248,11 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
 
     The spread (m, m, p + 1, p + 1): the covariance of the entries of (G, n), z = G y + n, at [i, j, a, b].
     """
-    random = ~channel.known_gains
-    varies = np.pad(np.ones((len(random), channel.inputs)) * random[:, None], ((0, 0), (0, 1)), constant_values=1.0)
-    cleaned: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
-    return cleaned
+    is_random = ~channel.known_gains
+    gain_varies = np.outer(is_random, np.ones(channel.inputs))
+    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # the noise always
+    without_rounding: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
+    return without_rounding
 
 
 def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
@@ -306,10 +306,10 @@ def _compute_mean_and_spread(channel: AbstractRandomAffine) -> tuple[Matrix, Ten
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_spreads(spreads)
     # Spreads of a sum add up, and that of its noise.
-    whole, size = channel.sum_in_places(dict(enumerate(means)), 1), channel.inputs + 1
+    mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * _make_power_of_constant(size)
-    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), 2) + noise
-    return whole + channel.noise.mean[:, None] * np.eye(size)[-1], spread
+    spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
+    return mean_of_maps + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
@@ -329,14 +329,14 @@ def _stack_spreads(spreads: Sequence[Tensor]) -> Tensor:
 
     A spread (m, m, p + 1, p + 1) is the covariance of the entries of (G, n), z = G y + n; y is the same for all maps.
     """
-    sizes, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
-    outputs = sum(sizes)
+    outputs_by_map, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
+    outputs = sum(outputs_by_map)
     # Places of the blocks' entries (i, j) in the flat (outputs, outputs).
-    rows = [np.arange(start, start + m) for start, m in zip(np.cumsum([0, *sizes]), sizes, strict=False)]
-    where = np.concatenate([(outputs * of_part[:, None] + of_part).reshape(-1) for of_part in rows])
-    flat = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
-    whole: Tensor = scatter((outputs**2, size**2), where, flat).reshape(outputs, outputs, size, size)
-    return whole
+    rows_by_map = np.split(np.arange(outputs), np.cumsum(outputs_by_map)[:-1])
+    places = np.concatenate([(outputs * rows[:, None] + rows).reshape(-1) for rows in rows_by_map])
+    entries = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
+    stacked: Tensor = scatter((outputs**2, size**2), places, entries).reshape(outputs, outputs, size, size)
+    return stacked
 
 
 def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
@@ -352,7 +352,7 @@ def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBoun
     """
     # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
     every = range(len(parts))  # numbers of the parts
-    mean = channel.sum_in_places({i: parts[i].mean for i in every}, 1)
+    mean = channel.sum_in_places({i: parts[i].mean for i in every}, axes=1)
     mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
     noise = map_of_known_law(channel.noise.covariance[..., None, None] * _make_power_of_constant(channel.inputs + 1))
     power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
@@ -389,9 +389,9 @@ def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, An
 
     `weighted`: by the number of a part (a map that the channel sums), its second-moment map and its weight.
     """
-    parts = {i: scale_map(part, weight) for i, (part, weight) in weighted.items()}
-    center = channel.sum_in_places({i: part.center for i, part in parts.items()}, 2)
-    return QuadraticMap(center, channel.sum_in_places({i: part.radius for i, part in parts.items()}, 2))
+    scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
+    center = channel.sum_in_places({i: moment_map.center for i, moment_map in scaled.items()}, axes=2)
+    return QuadraticMap(center, channel.sum_in_places({i: moment_map.radius for i, moment_map in scaled.items()}, 2))
 
 
 def _make_power_of_constant(size: int) -> np.ndarray:

@@ -47,7 +47,8 @@ class ChannelPosition(NamedTuple):
         if self.signal is None:
             return self
         chosen = np.array([*places, -1])
-        return self._replace(signal=self.signal._replace(second=self.signal.second[chosen[:, None], chosen]))
+        second = self.signal.second[chosen[:, None], chosen]
+        return self._replace(signal=self.signal._replace(second=second))
 
     def on_delay_line(self, times: int) -> "ChannelPosition":
         """Return the position at a map of the line (y_k, y_{k-1}, ...) of so many signals.
@@ -58,17 +59,19 @@ class ChannelPosition(NamedTuple):
         if self.signal is None:
             return self
         second, xp = self.signal.second, library(self.signal.second)
-        mean, blocks = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
-        line = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
-        return self._replace(signal=self.signal._replace(second=line))
+        mean = xp.tile(second[:-1, -1], times)
+        blocks = xp.kron(np.eye(times), second[:-1, :-1])  # on the diagonal
+        second_of_line = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
+        return self._replace(signal=self.signal._replace(second=second_of_line))
 
 
 def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMoment:
     """Return E (z, 1)(z, 1)' behind a random map, by its mean and second moments, from E (y, 1)(y, 1)' before it."""
     second, tensor = signal.second, moments.second
     mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
-    behind = xp.block([[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])
-    return signal._replace(second=behind)
+    of_z = xp.einsum("ijab,ab->ij", tensor, second)
+    second_behind = xp.block([[of_z, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    return signal._replace(second=second_behind)
 
 
 def refuse_gain_on_angles(got: str) -> ValueError:

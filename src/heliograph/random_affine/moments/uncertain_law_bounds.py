@@ -23,10 +23,13 @@ def tensors_of_law(moments: JointMoments, mean: Matrix) -> tuple[Tensor, Tensor,
 
     Maps of (y, 1)(y, 1)', for (G, n) of z = G y + n: of second moments of (G, n) - H0, of its mean - H0, and of G y.
     """
-    raw = moments.second
+    second_moment = moments.second
     law_mean = moments.mean[:-1]
-    spread = raw - symmetric_product(mean, law_mean) - symmetric_product(law_mean, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(law_mean - mean, law_mean - mean), drop_constant(raw)
+    cross = symmetric_product(mean, law_mean)
+    other_cross = symmetric_product(law_mean, mean)
+    spread = second_moment - cross - other_cross + symmetric_product(mean, mean)
+    shift = symmetric_product(law_mean - mean, law_mean - mean)
+    return spread, shift, drop_constant(second_moment)
 
 
 def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
@@ -36,10 +39,11 @@ def bound_all_laws(tensors: Tensor, mean: Matrix) -> QuadraticMap:
     s_v and that noise; else the middle of the range of each entry, with half the range as radius.
     """
     xp = library(tensors)
-    # `holds`: whether `exact`, the map of the largest s_v and noise, is above all.
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    exact, holds = _find_dominating_tensor(tensors, mean)
-    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
+    dominating, is_above_all = _find_dominating_tensor(tensors, mean)  # of the largest s_v and noise
+    center = xp.where(is_above_all, dominating, (low + high) / 2)
+    radius = xp.where(is_above_all, 0.0, (high - low) / 2)
+    return QuadraticMap(center, radius)
 
 
 def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
@@ -79,9 +83,10 @@ def _fit_multiples(gains: Array, shape: Tensor) -> tuple[Array, Array]:
     `gains` (law, m, m, p, p): a tensor of each law v.
     """
     xp = library(gains, shape)
-    size = xp.sum(shape**2)
-    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
-    return multiples, xp.abs(gains - multiples[:, None, None, None, None] * shape)
+    squared_norm = xp.sum(shape**2)
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(squared_norm > 0, squared_norm, 1.0)
+    fitted = multiples[:, None, None, None, None] * shape
+    return multiples, xp.abs(gains - fitted)
 
 
 def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
@@ -94,8 +99,9 @@ def _find_largest_noise(noises: Array) -> tuple[Matrix, Array]:
     # Judged in units in which N_max has ones on its diagonal, so that the tolerance is relative.
     unit = xp.sqrt(xp.diagonal(largest))
     unit = stop_gradient(xp.where(unit > 0, unit, 1.0))
-    gaps = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
-    return largest, xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE
+    eigenvalues = xp.linalg.eigvalsh(stop_gradient(largest - noises) / (unit[:, None] * unit))
+    is_above_all = xp.min(eigenvalues, initial=0.0) >= -PROPORTIONAL_TOLERANCE
+    return largest, is_above_all
 
 
 def bound_from_intervals(channel: AbstractRandomAffine, nominal: JointMoments, mean: Matrix) -> list[QuadraticMap]:

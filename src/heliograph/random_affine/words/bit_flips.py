@@ -64,12 +64,12 @@ class Flips(AbstractRandomAffine):
         Args:
             power: U of each word, its variance were all its values equally likely.
         """
-        left = 1 - float(self.gain.moment(2))
+        lost_share = 1 - float(self.gain.moment(2))
         if self.per_message or self.dimension == 1 or isinstance(self.error, Constant):
-            return GainAndNoise(self.gain, np.eye(self.dimension), Gaussian(left * np.diag(power)))
+            return GainAndNoise(self.gain, np.eye(self.dimension), Gaussian(lost_share * np.diag(power)))
         rows = np.eye(self.dimension)
-        alone = [GainAndNoise(self.gain, np.eye(1), Gaussian([[left * u]])) for u in power]
-        return Stack([Series([known(rows[i : i + 1]), link]) for i, link in enumerate(alone)])
+        links = [GainAndNoise(self.gain, np.eye(1), Gaussian([[lost_share * variance]])) for variance in power]
+        return Stack([Series([known(rows[i : i + 1]), link]) for i, link in enumerate(links)])
 
     def on_bits(self, bits: int, beside: int) -> "BitFlips":
         """Return the map of words that are written as `bits` numbers of -1 or 1, and `beside` numbers that pass."""
@@ -77,9 +77,8 @@ class Flips(AbstractRandomAffine):
 
     def moments(self, order: int) -> JointMoments:
         """Refuse moments: what a flipped bit does to a word depends on the word, which only the encoder knows."""
-        raise fail(
-            "channel of words", "a filter that is given the encoder of the words (encoder=...)", "one that is not"
-        )
+        expected = "a filter that is given the encoder of the words (encoder=...)"
+        raise fail("channel of words", expected, "one that is not")
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Refuse to draw: what a flipped bit does to a word depends on the word, which only the encoder knows."""
@@ -119,11 +118,11 @@ class BitFlips(AbstractRandomAffine):
         """
         rate_key, bit_key = jax.random.split(key)
         if self.per_message:
-            p = jnp.full(self.dimension, self.error.sample(rate_key))
+            error_rate = jnp.full(self.dimension, self.error.sample(rate_key))
         else:
-            p = jnp.stack([self.error.sample(k) for k in jax.random.split(rate_key, self.dimension)])
-        drawn = jax.random.uniform(bit_key, (self.dimension, self.bits), dtype=float)
-        signs = jnp.where(drawn < p[:, None], -1.0, 1.0)
+            error_rate = jnp.stack([self.error.sample(k) for k in jax.random.split(rate_key, self.dimension)])
+        uniform = jax.random.uniform(bit_key, (self.dimension, self.bits), dtype=float)
+        signs = jnp.where(uniform < error_rate[:, None], -1.0, 1.0)
         gains = jnp.concatenate([signs, jnp.ones((self.dimension, self.beside))], axis=1).reshape(-1)
         return jnp.diag(jnp.append(gains, 1.0))
 
@@ -179,4 +178,4 @@ def _read_error_rate(rate: object) -> Constant | Discrete:
     value = rate.value if isinstance(rate, Constant) else rate
     if np.ndim(value):  # type: ignore[arg-type]
         raise fail("error rate of a hop", f"{expected}; with other rates a word's mean is not affine in it", "several")
-    return Constant(scalar("error rate of a hop", value, 0.0, 0.5))  # type: ignore[arg-type]
+    return Constant(scalar("error rate of a hop", value, low=0.0, high=0.5))  # type: ignore[arg-type]

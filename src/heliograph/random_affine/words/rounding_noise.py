@@ -70,6 +70,7 @@ class RoundedNoise(AbstractNoise):
         gaussian: bool = False,
         matters: bool = False,
     ):
+        """Hold the law of v, and step D, half range, centre and dither of the rounding; flags as in the class."""
         # The sensor's noise; step D of the rounding, half of its range and its centre, by component; its dither.
         self.source, self.step, self.half, self.centre = source, step, half, centre
         self.dither, self.gaussian, self.matters = dither, gaussian, matters
@@ -130,17 +131,18 @@ class RoundedNoise(AbstractNoise):
     def given_signal(self, mean: Vector, variances: Vector) -> SignalNoise:
         """Return v + e, the sensor's noise and the error of rounding, beside a Gaussian signal of these moments.
 
-        The variance of e, in steps squared: E f(1 - f) by its series, f the place of y between two steps; else `known`,
-        the largest whatever y is. `whole` is that of e with the dither, which is taken off again if subtracted.
+        The variance of e, in steps squared: E f(1 - f) by its series, f the place of y between two steps; else the
+        largest whatever y is (`variances_in_steps`). `covariance` has that of e with the dither, which is taken off
+        again if subtracted.
         """
-        known = LARGEST[self.dither]
+        variances_in_steps = LARGEST[self.dither]
         if self.dither not in ("stochastic", "subtracted") or not self.gaussian:
-            whole = self.source.covariance + known.whole * self._squares()
-            return SignalNoise(self.columns, whole)
-        share = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
-        error = known.error if self.dither == "subtracted" else share
-        whole = jnp.asarray(self.source.covariance) + jnp.diag(share * jnp.asarray(self.step) ** 2)
-        return SignalNoise(self._with_error(error * self.step**2), whole)
+            covariance = self.source.covariance + variances_in_steps.whole * self._squares()
+            return SignalNoise(self.columns, covariance)
+        bound = self._bound_rounding(mean, variances + jnp.diagonal(jnp.asarray(self.source.covariance)))
+        error = variances_in_steps.error if self.dither == "subtracted" else bound
+        covariance = jnp.asarray(self.source.covariance) + jnp.diag(bound * jnp.asarray(self.step) ** 2)
+        return SignalNoise(self._with_error(error * self.step**2), covariance)
 
     def _bound_rounding(self, mean: Vector, variances: Vector) -> jax.Array:
         """Return an upper bound of E f (1 - f), f in [0, 1] the place of y between two words, D apart, y of N(m, s^2).
@@ -156,8 +158,8 @@ class RoundedNoise(AbstractNoise):
         place = place - jnp.floor(place)
         damped = jnp.exp(-2 * np.pi**2 * k**2 * relative_variance) / (np.pi * k) ** 2
         tail = jnp.exp(-2 * np.pi**2 * TERMS**2 * relative_variance) / (np.pi**2 * TERMS)
-        share = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + tail
-        return jnp.clip(share, 0.0, 0.25)
+        bound = 1 / 6 - jnp.sum(damped * jnp.cos(2 * np.pi * k * place), axis=0) + tail
+        return jnp.clip(bound, 0.0, 0.25)
 
     def _squares(self) -> Square:
         """Return diag(D^2), the squares of the steps D of rounding on a diagonal."""
@@ -201,11 +203,11 @@ class RoundedNoise(AbstractNoise):
         """
         if sum(powers) > 2:
             raise fail("noise of a rounded measurement", "a filter of means and covariances (linear_filter)", "another")
-        places = [i for i, power in enumerate(powers) for _ in range(power)]
-        mean = [self.mean[i] for i in places]
-        if len(places) < 2:
-            return mean[0] if mean else 1.0
-        return mean[0] * mean[1] + self.covariance[places[0], places[1]]
+        components = [i for i, power in enumerate(powers) for _ in range(power)]
+        means = [self.mean[i] for i in components]
+        if len(components) < 2:
+            return means[0] if means else 1.0
+        return means[0] * means[1] + self.covariance[components[0], components[1]]
 
 
 def find_rounded_noises(*models: PyTree) -> Sequence[RoundedNoise]:

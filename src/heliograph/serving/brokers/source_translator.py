@@ -7,7 +7,7 @@ from pathlib import Path
 
 from heliograph.files.messages.message_files import FileMessage, make_default_topic
 from heliograph.files.sources.message_fields import decode_json, parse_arrival
-from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.message_reading import Reading, Unread
 from heliograph.files.sources.sources import Sources
 from heliograph.model.checks.refusal_reasons import RefusedError
 from heliograph.numerics.check import InputError, fail, instance, show_value

@@ -113,13 +113,13 @@ class CrossCovariances:
 
     def _check_relays(self, relays: Mapping[str, Sequence[str]]) -> None:
         """Raise ValueError unless each relay receives some of the nodes, and no node has two relays."""
-        listed = [name for names in relays.values() for name in names]
-        unknown = sorted(set(listed) - set(self.nodes))
+        received_nodes = [name for names in relays.values() for name in names]
+        unknown = sorted(set(received_nodes) - set(self.nodes))
         if not relays or unknown or not all(relays.values()):
             raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
-        if len(set(listed)) < len(listed):
-            twice = sorted({name for name in listed if listed.count(name) > 1})
-            raise fail("nodes", "one relay for each", f"several for {twice}")
+        if len(set(received_nodes)) < len(received_nodes):
+            repeated = sorted({name for name in received_nodes if received_nodes.count(name) > 1})
+            raise fail("nodes", "one relay for each", f"several for {repeated}")
 
 
 def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
@@ -129,10 +129,11 @@ def _choose_weights(errors: ErrorSources) -> Float[np.ndarray, "n node n"]:
     linear in the nodes; else by the joint covariance of all errors.
     """
     # Least eigenvalue of the independent parts, in units of each component's whole deviation.
-    scale = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
-    scale = np.where(scale > 0, scale, 1.0)
-    least = np.linalg.eigvalsh(errors.independent / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(solve_factored_weights(*errors) if least > REGULAR else matrix_weights(errors.joint()))
+    deviation = np.sqrt(np.einsum("iaa->ia", errors.covariances()))
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    scaled = errors.independent / (deviation[:, :, None] * deviation[:, None])
+    is_regular = np.linalg.eigvalsh(scaled)[:, 0].min() > REGULAR
+    return np.asarray(solve_factored_weights(*errors) if is_regular else matrix_weights(errors.joint()))
 
 
 def cross_covariances(
@@ -216,8 +217,9 @@ def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFa
     filter_states, _, _, (centre_state,), *_ = filters.init()
     nodes, n = centre_state.errors.bias.shape
     # New sources of each step: the plant's noise, and noises of measurements where nodes share them.
-    sources = n + (nodes * centre.size if isinstance(centre.observation_model, SharedObservation) else 0)
-    start = filter_states, make_initial_factors(centre_state.errors, sources * len(u))
+    are_shared = isinstance(centre.observation_model, SharedObservation)
+    sources_per_step = n + (nodes * centre.size if are_shared else 0)
+    start = filter_states, make_initial_factors(centre_state.errors, sources_per_step * len(u))
 
     def compute_matrices(states: PyTree, u_k: jax.Array, k: jax.Array) -> LinearStep:
         """Return the matrices of all nodes' filters in step k, from their states before it."""
@@ -235,16 +237,17 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
 
         Covariances do not depend on data, so means are taken as 0.
         """
-        (states, centre_states), (k, u_k) = carry, row
+        states, centre_states = carry
+        k, u_k = row
         covariances: dict[str, jax.Array] = {}
-        following = []
+        next_centre_states = []
         for centre, state in zip(filters.linear_centres, centre_states, strict=True):
             means = [jnp.zeros((filters.alike[kind].nodes, filters.n)) for kind, _ in centre.sources]
             matrices = filters.list_step_matrices(centre, states, u_k, k)
             after, estimates = centre.step(state, matrices, means, u_k, k)
-            following.append(after)
+            next_centre_states.append(after)
             covariances |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
-        return (filters.step_without_data(states, u_k, k), tuple(following)), covariances
+        return (filters.step_without_data(states, u_k, k), tuple(next_centre_states)), covariances
 
     states, _, _, centre_states, *_ = filters.init()
     _, covariances = jax.lax.scan(step, (states, centre_states), (jnp.arange(len(u)), jnp.asarray(u)))

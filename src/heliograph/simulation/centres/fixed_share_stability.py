@@ -36,10 +36,12 @@ def check_error_decay(
     """
     arrives = np.zeros(graph.present.shape)
     arrives[:, 1:][graph.present[:, 1:]] = arrival  # place 0 of each node is the node itself
-    growth, sizes = _compute_growth_and_sizes(graph, arrives, _make_error_maps(graph, shares, plant, squares))
+    error_maps = _make_error_maps(graph, shares, plant, squares)
+    growth, error_sizes = _compute_growth_and_sizes(graph, arrives, error_maps)
     if growth > 1 + SLOW:
+        node = graph.nodes[error_sizes.argmax()]
         raise fail(what, "shares with which errors decay, whatever is lost (or a rule that intersects)",
-                   f"squares that grow by {growth:.3g} a step at node {graph.nodes[sizes.argmax()]!r}")  # fmt: skip
+                   f"squares that grow by {growth:.3g} a step at node {node!r}")  # fmt: skip
 
 
 class _ErrorMaps(NamedTuple):
@@ -109,9 +111,9 @@ def _take_moments_of_pairs(blocks: np.ndarray, graph: Graph) -> np.ndarray:
 
     `blocks`: E[e_i e_j'] of all nodes (node, n, node, n).
     """
-    itself, senders = np.arange(len(graph.senders)), graph.senders
-    cross = blocks[itself[:, None], :, senders, :]
-    of_node = np.broadcast_to(blocks[itself, :, itself, :][:, None], cross.shape)
+    nodes, senders = np.arange(len(graph.senders)), graph.senders
+    cross = blocks[nodes[:, None], :, senders, :]
+    of_node = np.broadcast_to(blocks[nodes, :, nodes, :][:, None], cross.shape)
     top = np.concatenate([of_node, cross], axis=3)
     bottom = np.concatenate([cross.swapaxes(2, 3), blocks[senders, :, senders, :]], axis=3)
     return np.concatenate([top, bottom], axis=2)

@@ -103,11 +103,11 @@ def _predict_by_first(
 
     `states`: of the filters, stacked too: the first one's takes the estimate in place of its own.
     """
-    numbers, static = eqx.partition(filters, eqx.is_array)
-    head, state = jax.tree.map(lambda leaf: leaf[0], (numbers, states))
-    first: AbstractFilter = eqx.combine(head, static)
-    predicted: Gaussian = gaussian_of(first.predict(with_gaussian(state, estimate), u, k))
-    return predicted
+    arrays, static = eqx.partition(filters, eqx.is_array)
+    first_arrays, state = jax.tree.map(lambda leaf: leaf[0], (arrays, states))
+    first_filter: AbstractFilter = eqx.combine(first_arrays, static)
+    prior: Gaussian = gaussian_of(first_filter.predict(with_gaussian(state, estimate), u, k))
+    return prior
 
 
 def _correct_in_turn(
@@ -135,8 +135,9 @@ def _correct_in_turn(
 
         `row`: the filter's arrays (`static` is the rest of it), its predicted state, and the node's measurement.
         """
-        node_numbers, prior, z = row
-        after, innovation = eqx.combine(node_numbers, static).correct(with_gaussian(prior, before.x), z, k)
+        filter_arrays, prior, z = row
+        filter = eqx.combine(filter_arrays, static)
+        after, innovation = filter.correct(with_gaussian(prior, before.x), z, k)
         distance, arrived = innovation_distance(innovation)
         return _CorrectedEstimate(gaussian_of(after), before.distance + distance, before.arrived + arrived), None
 
@@ -161,7 +162,7 @@ def make_fused_innovations(network: Network, alike: Sequence[StackedFilters]) ->
     tests: dict[str, FusedInnovation] = {}
     if network.common is not None or network.relays is not None or network.shared:
         return tests
-    places, plant = network.places, at(network.plant, 0)
+    places, plant = network.places, at(network.plant, k=0)
     claims = network.claims()
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and claims[FUSED][name] != "none":

@@ -1,5 +1,6 @@
 """Fusion centre that knows the network: joint moments of the local errors, before any data; and it as a filter."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -80,8 +81,9 @@ class FusionCentre(Module):
 
         `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
         """
-        plant = at(self.plant, 0)
-        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        plant = at(self.plant, k=0)
+        initial_means = jnp.concatenate(starts)[self.order]
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, initial_means)
         return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
 
     def step_errors(self, errors: ErrorMoments, filters: LinearStep, u: jax.Array, k: jax.Array) -> CentreStep:
@@ -102,7 +104,8 @@ class FusionCentre(Module):
         plant: LinearPlant = at(self.plant, k)
         # x+ = A x + shift + w; what is measured of the state after the step depends on its moments there.
         motion = Motion(plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u))
-        observation = self.observation_model.observe(*propagate_state(mean, covariance, motion), k)
+        mean_after, covariance_after = propagate_state(mean, covariance, motion)
+        observation = self.observation_model.observe(mean_after, covariance_after, k)
         return make_error_step(filters, motion, observation)
 
     def propagate_error_factors(
@@ -125,7 +128,8 @@ class FusionCentre(Module):
             carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
             """Step the filters' states over step k, and the factors of the errors' covariance by their matrices."""
-            (states, factors), (k, u_k) = carry, row
+            states, factors = carry
+            k, u_k = row
             # Moments of the plant's state: row 0 of the means, and its part of the factors.
             covariance = jnp.asarray(factors.state @ factors.state.T)
             matrices = compute_matrices(states, u_k, k)
@@ -143,24 +147,29 @@ class FusionCentre(Module):
         return join_step_matrices(parts, self.order, self.size)
 
     def step(
-        self, state: CentreState, parts: Sequence[LinearStep], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
+        self,
+        state: CentreState,
+        matrices_by_source: Sequence[LinearStep],
+        means_by_source: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
     ) -> tuple[CentreState, dict[str, Estimate]]:
         """Return the next state, and the fused estimates of step k by name of the fusion.
 
         Args:
             state: before the step.
-            parts: matrices of the sources' filters in the step, with a leading axis of nodes.
-            means: of their estimates after it (node, n), by source.
+            matrices_by_source: matrices of the sources' filters in the step, with a leading axis of nodes.
+            means_by_source: of their estimates after it (node, n), by source.
             u: inputs of the plant over the step.
             k: number of the step.
         """
-        happened = self.step_errors(state.errors, self.gather_matrices(parts), u, k)  # what the errors went through
-        reports = jnp.concatenate(means)[self.order]
-        after, results = {}, {}
+        error_step = self.step_errors(state.errors, self.gather_matrices(matrices_by_source), u, k)
+        reports = jnp.concatenate(means_by_source)[self.order]
+        rules_after, estimates = {}, {}
         for name, rule in self.rules.items():
-            after[name], (mean, covariance) = rule.fuse_step(state.rules[name], happened, reports)
-            results[name] = Estimate(mean, covariance, self.claim)
-        return CentreState(happened.errors, after), results
+            rules_after[name], (mean, covariance) = rule.fuse_step(state.rules[name], error_step, reports)
+            estimates[name] = Estimate(mean, covariance, self.claim)
+        return CentreState(error_step.errors, rules_after), estimates
 
 
 # Axes of a filter's matrices that are as long as its measurement, counted from the last.
@@ -179,8 +188,8 @@ def join_step_matrices(parts: Sequence[Matrices], order: np.ndarray, size: int) 
 
         MEASURED: by field the axes, counted from the last, that are as long as a measurement.
         """
-        padding = [(0, size - length) if axis - leaf.ndim in MEASURED.get(name, ()) else (0, 0)
-                   for axis, length in enumerate(leaf.shape)]  # fmt: skip
+        measurement_axes = {leaf.ndim + axis for axis in MEASURED.get(name, ())}
+        padding = [(0, size - n) if axis in measurement_axes else (0, 0) for axis, n in enumerate(leaf.shape)]
         return jnp.pad(leaf, padding)
 
     matrices = type(parts[0])
@@ -217,8 +226,9 @@ def find_claim_of_informed_fusion(rule: str, plant: AnyPlant, nodes: Parts, shar
         _check_data_dependent_gains(rule, nodes, shared)
         return "nominal"
     _check_linear_and_planned(rule, plant, nodes)
-    known: Claim = "nominal" if any(_has_uncertain_law(channel) for _, channel, _ in nodes.values()) else "exact"
-    return lower_claim_by_noise(known, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
+    are_uncertain = any(_has_uncertain_law(channel) for _, channel, _ in nodes.values())
+    claim: Claim = "nominal" if are_uncertain else "exact"
+    return lower_claim_by_noise(claim, plant, [(sensor, channel) for sensor, channel, _ in nodes.values()])
 
 
 def has_data_dependent_gains(nodes: Parts) -> bool:
@@ -241,11 +251,13 @@ def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     for name, (sensor, _, filter) in nodes.items():
-        where = f"fusion by {rule}: node {name!r}"
+        node_in_words = f"fusion by {rule}: node {name!r}"
         if not isinstance(first(sensor), LinearSensor):
-            raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
+            raise fail(node_in_words, "a LinearSensor", type(first(sensor)).__name__)
         if not filter.is_linear:
-            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(filter).__name__)
+            raise fail(
+                node_in_words, "a filter of the plant's state whose gains depend on no data", type(filter).__name__
+            )
 
 
 def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
@@ -258,10 +270,10 @@ def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complet
     Raises:
         ValueError: nodes that lose measurements, which the centre cannot know from a missing report.
     """
-    lossy = [name for name, receives_all in complete.items() if not receives_all]
-    if lossy:
+    nodes_that_lose = [name for name, receives_all in complete.items() if not receives_all]
+    if nodes_that_lose:
         raise fail(f"fusion by {rule} of reports", "nodes that lose no measurements, of which the centre would have "
-                   "to know", f"losses at {lossy}")  # fmt: skip
+                   "to know", f"losses at {nodes_that_lose}")  # fmt: skip
     names = list(complete)
     channels = [link.channel for link in fusion.links(names) if link.channel is not None]
     for quantizer in fusion.quantizers(names):
@@ -297,7 +309,7 @@ class NodeFiltersWithoutData(Protocol):
         """Return the filters' states after step k."""
 
 
-class CentreFilterState(NamedTuple):
+class CentreJointState(NamedTuple):
     """What the centre knows after a step.
 
     Args:
@@ -333,40 +345,42 @@ class CentreFilter(AbstractSizedFilter):
     quantized: bool = eqx.field(static=True)
 
     @compile_in_float64
-    def init(self) -> CentreFilterState:
+    def init(self) -> CentreJointState:
         """Return the state before any report: nodes' filters, moments of their errors, and what the centre believes."""
-        states, _, _, known, *_ = self.filters.init()
-        errors = known[0].errors
-        return CentreFilterState(
-            states, errors, make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
-        )
+        states, _, _, centre_states, *_ = self.filters.init()
+        errors = centre_states[0].errors
+        belief = make_initial_belief(errors, self.ages - 1, self.widest, self.quantized)
+        return CentreJointState(states, errors, belief)
 
     @predicts
-    def predict(self, state: CentreFilterState, u: ArrayLike = (), k: Step = 0) -> CentreFilterState:
+    def predict(self, state: CentreJointState, u: ArrayLike = (), k: Step = 0) -> CentreJointState:
         """Return the state after the nodes filtered step k and sent their reports: plant and all errors are predicted.
 
         The nodes' gains depend on no data, so that the centre computes them itself.
         """
-        (centre,), u, step = self.filters.linear_centres, jnp.asarray(u), jnp.asarray(k)
+        (centre,) = self.filters.linear_centres  # the one that fuses the reports
+        u, step = jnp.asarray(u), jnp.asarray(k)
         filters: LinearStep = centre.gather_matrices(self.filters.list_step_matrices(centre, state.nodes, u, step))
-        happened = centre.step_errors(state.errors, filters, u, step)
-        following = self.filters.step_without_data(state.nodes, u, step)
-        return CentreFilterState(following, happened.errors, propagate_errors(state.known, happened, at(self.links, k)))
+        error_step = centre.step_errors(state.errors, filters, u, step)
+        node_states = self.filters.step_without_data(state.nodes, u, step)
+        belief = propagate_errors(state.known, error_step, at(self.links, k))
+        return CentreJointState(node_states, error_step.errors, belief)
 
     @corrects
-    def correct(self, state: CentreFilterState, z: ArrayLike, k: Step = 0) -> tuple[CentreFilterState, Innovation]:
+    def correct(self, state: CentreJointState, z: ArrayLike, k: Step = 0) -> tuple[CentreJointState, Innovation]:
         """Return the state corrected by the reports that arrived, and their innovation; z is NaN where one did not.
 
-        `rows`: places of z among all numbers that could come, (age, node, widest): of every delay, padded to the
-        longest report.
+        `indices`: of z among all numbers that could come, (age, node, widest): of every delay, padded to the longest
+        report.
         """
-        nodes, rows = state.known.past.gain.shape[1], np.array(self.rows)
-        reports = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[rows].set(jnp.asarray(z))
-        known, expected = correct_with_reports(state.known, reports.reshape(self.ages, nodes, self.widest))
-        mean, covariance = expected.mean[rows], expected.covariance[rows][:, rows]
-        return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
+        shape = self.ages, state.known.past.gain.shape[1], self.widest
+        indices = np.array(self.rows)
+        reports = jnp.full(math.prod(shape), jnp.nan).at[indices].set(jnp.asarray(z))
+        belief, expected = correct_with_reports(state.known, reports.reshape(shape))
+        mean, covariance = expected.mean[indices], expected.covariance[indices][:, indices]
+        return state._replace(known=belief), gaussian_innovation(jnp.asarray(z), mean, covariance)
 
     @estimates
-    def estimate(self, state: CentreFilterState) -> Estimate:
+    def estimate(self, state: CentreJointState) -> Estimate:
         """Return the best linear estimate of the plant's state."""
         return Estimate(*estimate_state(state.known, len(self.states)), self.claim)

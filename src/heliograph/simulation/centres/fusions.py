@@ -70,7 +70,8 @@ class StackedFusions(Module):
         if self.quantizers is None:
             return ()
         fusions, nodes = self.order.shape
-        return map_all(map_all(lambda quantizer: at(quantizer, 0).init(n), nodes), fusions)(self.quantizers)
+        init_of_nodes = map_all(lambda quantizer: at(quantizer, k=0).init(n), nodes)
+        return map_all(init_of_nodes, fusions)(self.quantizers)
 
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
@@ -110,16 +111,19 @@ class StackedFusions(Module):
         }
         return states, fused, uplinks
 
-    def _gather_by_fusion(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+    def _gather_by_fusion(self, values_by_kind: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
 
-        `parts`: (filter, node, ...) by kind of filter; `sources`: for each fusion the (kind, filter) that it fuses.
+        `values_by_kind`: (filter, node, ...) by kind of filter; `sources`: for each fusion the (kind, filter) that it
+        fuses.
         """
-        joined = [jnp.concatenate([parts[kind][f] for kind, f in source]) for source in self.sources]
-        # In order already: no gather is compiled.
-        if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
-            return jnp.stack(joined)
-        return jnp.stack([values[order] for values, order in zip(joined, self.order, strict=True)])
+        values_by_fusion = [
+            jnp.concatenate([values_by_kind[kind][filter] for kind, filter in sources]) for sources in self.sources
+        ]
+        are_in_order = all(np.array_equal(order, np.arange(len(order))) for order in self.order)
+        if are_in_order:  # no gather is compiled
+            return jnp.stack(values_by_fusion)
+        return jnp.stack([values[order] for values, order in zip(values_by_fusion, self.order, strict=True)])
 
 
 class ReportFusion(Module):
@@ -331,8 +335,8 @@ def find_source_filters(
         nodes: names of the nodes, each of which has the filter.
         name: of the filter.
     """
-    found = [places[node, name] for node in nodes]
-    sources = tuple(dict.fromkeys((place.kind, place.filter) for place in found))  # each once, in order
+    places_of_nodes = [places[node, name] for node in nodes]
+    sources = tuple(dict.fromkeys((place.kind, place.filter) for place in places_of_nodes))  # each once, in order
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     # Nodes in the order in which the sources hold them.
     positions = {node: i for i, node in enumerate(node for names in groups for node in names)}

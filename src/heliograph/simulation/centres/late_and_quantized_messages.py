@@ -44,14 +44,14 @@ class ArrivingEstimates(NamedTuple):
 
 
 def find_event_senders(
-    alpha: Array, off: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
+    alpha: Array, difference: Float[jax.Array, "node degree n"], information: Float[jax.Array, "node degree n n"],
     senders: np.ndarray, present: np.ndarray,
 ) -> Bool[jax.Array, " node"]:  # fmt: skip
     """Return which nodes send: those whose estimate is off by d' P^-1 d > alpha n from what somebody received last.
 
     Args:
         alpha: threshold of the events.
-        off: d, for each node and place the sender's estimate less what the node received of it last.
+        difference: d, for each node and place the sender's estimate less what the node received of it last.
         information: P^-1 of the sender's estimate.
         senders: of whom each node receives (node, degree), itself first.
         present: where it has a neighbour (node, degree).
@@ -59,11 +59,13 @@ def find_event_senders(
     Where the message arrives, the error of what was received last is then at most (1 + sqrt(alpha n))^2 P, whatever got
     lost before: E[(e + d) (e + d)'] <= (1 + 1/t) P + (1 + t) E[d d'], d d' <= alpha n P, any t.
     """
-    far = jnp.einsum("ida,idab,idb->id", off, information, off) > alpha * off.shape[-1]
+    squared_distance = jnp.einsum("ida,idab,idb->id", difference, information, difference)
+    is_far = squared_distance > alpha * difference.shape[-1]
     # A node sends if it is far from what any neighbour received last; place 0 is the node itself.
-    far_for_neighbours = (far & present)[:, 1:]
-    receivers = jnp.zeros(len(off), dtype=int).at[senders[:, 1:]].add(far_for_neighbours.astype(int))
-    return receivers > 0
+    is_far_for_neighbour = (is_far & present)[:, 1:].astype(int)
+    zeros = jnp.zeros(len(difference), dtype=int)
+    receivers_in_need = zeros.at[senders[:, 1:]].add(is_far_for_neighbour)
+    return receivers_in_need > 0
 
 
 def quantize_estimate(
@@ -73,9 +75,10 @@ def quantize_estimate(
 
     The quantizer's state is (), as one between neighbours has none.
     """
-    value = quantizer.step((), mean)[1]
-    received = jnp.where(jnp.any(value.saturated), jnp.nan, value.value)
-    return received, widen_by_quantization(covariance, jnp.asarray(quantizer.error(len(mean))))
+    _, quantized = quantizer.step((), mean)
+    received = jnp.where(jnp.any(quantized.saturated), jnp.nan, quantized.value)
+    error_bound = jnp.asarray(quantizer.error(len(mean)))
+    return received, widen_by_quantization(covariance, error_bound)
 
 
 def gather_messages(

@@ -61,8 +61,9 @@ class LinearisedCentre(Module):
 
         `starts`: initial means (node, n) of the filters of each source, a group of nodes; `order` sorts them by node.
         """
-        plant = at(self.plant, 0)
-        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        plant = at(self.plant, k=0)
+        initial_means = jnp.concatenate(starts)[self.order]
+        errors = make_initial_errors(plant.initial_mean, plant.initial_covariance, initial_means)
         mean = jnp.asarray(plant.initial_mean)
         return {name: LinearisedFusionState(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
 
@@ -107,17 +108,18 @@ class LinearisedCentre(Module):
         return following, results
 
 
-def _make_joint_error_step(motion: Motion, keep: jax.Array, linear: LinearisedStep) -> ErrorStep:
-    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors; `keep`: F_i = I - K_i C_i (node, n, n).
+def _make_joint_error_step(motion: Motion, error_factor: jax.Array, linear: LinearisedStep) -> ErrorStep:
+    """Return the step e_i+ = F_i (A e_i + w) - K_i nu_i of all nodes' errors, `error_factor` being F_i = I - K_i C_i.
 
-    A, w: of the plant's `motion`; K_i, nu_i: gain and measurement noise of node i (`linear`). The state x itself stands
-    before the errors, which do not depend on it; only x is shifted, so that errors of mean zero keep that mean.
+    A, w: of the plant's `motion`; K_i, nu_i: gain and measurement noise of node i (`linear`). The state x itself
+    stands before the errors, which do not depend on it; only x is shifted, so that errors of mean zero keep that
+    mean. Shapes: error_factor (node, n, n).
     """
-    nodes, n, _ = keep.shape
+    nodes, n, _ = error_factor.shape
     return ErrorStep(
-        transition=ErrorMap(motion.matrix, jnp.zeros_like(keep), keep @ motion.matrix),
+        transition=ErrorMap(motion.matrix, jnp.zeros_like(error_factor), error_factor @ motion.matrix),
         shift=jnp.pad(motion.shift, (0, nodes * n)),
-        of_noise=jnp.concatenate([jnp.eye(n), keep.reshape(nodes * n, n)]),
+        of_noise=jnp.concatenate([jnp.eye(n), error_factor.reshape(nodes * n, n)]),
         process=motion.noise,
         gain=linear.gain,
         received=linear.noise,
@@ -137,7 +139,7 @@ def _replace_plant_moments(before: ErrorMoments, after: ErrorMoments) -> ErrorMo
 
 
 def _compute_drift_of_mean_errors(
-    state: ReportsBelief, matrix: jax.Array, moved: jax.Array, keep: jax.Array, linear: LinearisedStep
+    state: ReportsBelief, matrix: jax.Array, predicted_mean: jax.Array, error_factor: jax.Array, linear: LinearisedStep
 ) -> jax.Array:
     """Return F_i (E e_i- - A E e_i) (node, n): how far each mean error moves other than by the linear map A.
 
@@ -146,10 +148,11 @@ def _compute_drift_of_mean_errors(
     Args:
         state: the rule's, with the means E e_i before the step.
         matrix: A (n, n).
-        moved: E x- (n,).
-        keep: F_i of all nodes (node, n, n).
+        predicted_mean: E x- (n,).
+        error_factor: F_i of all nodes (node, n, n).
         linear: with the filters' predictions m_i- (node, n).
     """
-    nodes, n, _ = keep.shape
-    before = state.gaussian.mean[n:].reshape(nodes, n)
-    return jnp.einsum("iab,ib->ia", keep, moved - linear.predicted - before @ matrix.T)
+    nodes, n, _ = error_factor.shape
+    mean_errors = state.gaussian.mean[n:].reshape(nodes, n)
+    mean_errors_predicted = predicted_mean - linear.predicted  # E e_i-
+    return jnp.einsum("iab,ib->ia", error_factor, mean_errors_predicted - mean_errors @ matrix.T)

@@ -84,14 +84,14 @@ class Mesh(Module):
     def has_long_step(self) -> bool:
         """Return whether a step has more operations than MESH: too many for native code, which writes out each one."""
         n = len(first(self.plant).states)
-        # About n^2 operations for each message, and N^2 twice for a joint covariance of N = nodes n numbers.
-        for_messages = self.edges.rounds * int(np.count_nonzero(self.edges.present)) * n * n
+        # About n^2 operations for each message, and twice N^2 for a joint covariance of N = nodes n numbers.
+        messages = self.edges.rounds * int(np.count_nonzero(self.edges.present))
         size = len(self.senders) * n if self.needs_joint else 0
-        return max(for_messages, 2 * size**2) > MESH
+        return max(messages * n * n, 2 * size**2) > MESH
 
     def init(self) -> MeshState:
         """Return the state before the first step: the plant's mean and covariance at every node."""
-        plant = at(self.plant, 0)
+        plant = at(self.plant, k=0)
         mean, covariance = jnp.asarray(plant.initial_mean), jnp.asarray(plant.initial_covariance)
         nodes, n = len(self.senders), len(mean)
         # Before any data all nodes' errors are the same.
@@ -206,13 +206,15 @@ class Mesh(Module):
         """
         if messages is not None:
             return messages.mean[messages.senders]
-        now = mean[self.senders]
+        present_estimates = mean[self.senders]
         if state.sent is None or self.alpha is None:
-            return now
+            return present_estimates
         # With events: a node sends only where its estimate has moved beyond what somebody received last.
         information = jax.vmap(invert_positive_definite)(state.covariance)[self.senders]
-        moved = find_event_senders(self.alpha, now - state.sent, information, self.senders, self.edges.present)
-        return jnp.where((arrives & moved[self.senders])[..., None], now, state.sent)
+        are_sent = find_event_senders(
+            self.alpha, present_estimates - state.sent, information, self.senders, self.edges.present
+        )
+        return jnp.where((arrives & are_sent[self.senders])[..., None], present_estimates, state.sent)
 
     def compute_step_without_estimates(
         self, covariance: Float[Array, "node n n"], blocks: Float[Array, "node degree n degree n"] | None,
@@ -321,11 +323,11 @@ class Mesh(Module):
 
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
         """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
-        known, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
+        has_measurement, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         # In each round a node comes to have what the senders of the messages that arrive had before it.
-        for number in range(self.edges.rounds):
-            known = jnp.any(known[self.senders] & arrived[:, number, :, None], axis=1)
-        return known
+        for round_number in range(self.edges.rounds):
+            has_measurement = jnp.any(has_measurement[self.senders] & arrived[:, round_number, :, None], axis=1)
+        return has_measurement
 
     def sum_over_messages(self, values: jax.Array, present: jax.Array) -> jax.Array:
         """Return for each node the sum of `values` (node, ...) of the senders whose messages it has.
@@ -362,9 +364,8 @@ class Mesh(Module):
             """Return the gains of one node, with weights computed ahead or those of the rule for what it received."""
             step = NodeStep(motion.matrix, motion.noise, arrived=information, complete=complete)
             if weights_ahead:
-                # Weights C_j = front parts_j with front = I.
-                parts, fused_covariance = weights_ahead
-                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), parts, fused_covariance), step)
+                neighbour_weights, fused_covariance = weights_ahead
+                return gains_of(NeighbourWeights(jnp.eye(len(motion.shift)), neighbour_weights, fused_covariance), step)
             return rule.neighbour_gains(received, step)
 
         gains: NodeGains = self._map_nodes(compute_node_gains, covariance, blocks, present, information, complete,
@@ -385,9 +386,8 @@ class Mesh(Module):
 
         `places`: for each group the numbers of its nodes in the mesh. The axis of 1: of filters, here the fusion alone.
         """
-        return tuple(
-            Estimate(mean[jnp.array(rows)][None], covariance[jnp.array(rows)][None], self.claim) for rows in self.places
-        )
+        groups = map(jnp.array, self.places)
+        return tuple(Estimate(mean[nodes][None], covariance[nodes][None], self.claim) for nodes in groups)
 
 
 def _weigh_neighbours(rule: AbstractFusion, received: NeighbourEstimates, *_: PyTree) -> NeighbourWeights:

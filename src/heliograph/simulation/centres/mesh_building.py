@@ -55,14 +55,15 @@ def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObser
 
     Nodes of one group of the network have models of one structure, which are stacked.
     """
-    groups: list[ObservationModel | None] = []
+    models_by_group: list[ObservationModel | None] = []
     places: dict[str, int] = {}  # of each node among all, group after group
     for names in network.groups:
         sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        groups.append(stack_nodes([n.sensor for n in sensors], [n.channel for n in sensors]) if sensors else None)
+        channels = [node.channel for node in sensors]
+        models_by_group.append(stack_nodes([node.sensor for node in sensors], channels) if sensors else None)
         places |= {node: len(places) + i for i, node in enumerate(names)}
     return SeparateObservations(
-        groups=tuple(groups),
+        groups=tuple(models_by_group),
         order=np.array([places[node] for node in nodes]),
         size=max(1, *(node.received for node in network.nodes.values())),
         counts=tuple(map(len, network.groups)),

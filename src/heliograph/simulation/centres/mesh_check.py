@@ -85,14 +85,13 @@ def find_claim_of_errors(name: str, fusion: Fusion, network: HasNodes) -> Claim:
 
     `name`: of the fusion between neighbours `fusion` in the network.
     """
-    parts = {}
+    parts_by_node = {}
     for name_of_node in network.mesh_nodes(name):
         node = network.nodes[name_of_node]
         if isinstance(node, Node):
-            parts[name_of_node] = node.sensor, node.channel, node.filters[fusion.filter]
-    return find_claim_of_informed_fusion(
-        f"{type(fusion.rule).__name__} between neighbours", network.plant, parts, shared=False
-    )
+            parts_by_node[name_of_node] = node.sensor, node.channel, node.filters[fusion.filter]
+    rule = f"{type(fusion.rule).__name__} between neighbours"
+    return find_claim_of_informed_fusion(rule, network.plant, parts_by_node, shared=False)
 
 
 def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
@@ -103,12 +102,13 @@ def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     Weaker where laws are known up to a radius, weights are frozen means over losses, or data decide what arrives: a
     sender by what it measured, limits by what they refuse, a quantizer by what it cannot send.
     """
-    known = find_claim_of_errors(name, fusion, network)
-    senders = [n for node in network.mesh_nodes(name) if isinstance(n := network.nodes[node], Node)]
-    by_data = fusion.quantizer is not None or any(n.chosen_by_value for n in senders)
-    if by_data or isinstance(fusion.rule, FrozenWeights):
-        return weakest([known, "nominal"])
-    return known if fusion.rule.needs_joint else weakest([known, "upper"])
+    claim_of_errors = find_claim_of_errors(name, fusion, network)
+    nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
+    senders = [node for node in nodes if isinstance(node, Node)]
+    do_data_decide = fusion.quantizer is not None or any(sender.chosen_by_value for sender in senders)
+    if do_data_decide or isinstance(fusion.rule, FrozenWeights):
+        return weakest([claim_of_errors, "nominal"])
+    return claim_of_errors if fusion.rule.needs_joint else weakest([claim_of_errors, "upper"])
 
 
 def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
@@ -235,22 +235,23 @@ def _measures_mode(node: object, vector: np.ndarray) -> bool:
     """Return whether a node's own measurement shows the plant's mode of this eigenvector: H v is not 0, to RANK."""
     if not isinstance(node, Node):
         return False
-    return bool(np.any(np.abs(_scale_rows(_get_gain_and_noise(node)[0]) @ vector) > RANK))
+    gain, _ = _get_gain_and_noise(node)
+    return bool(np.any(np.abs(_scale_rows(gain) @ vector) > RANK))
 
 
 def _list_unseeing_nodes(graph: Graph, a: np.ndarray, squares: np.ndarray) -> tuple[list[str], list[str]]:
     """Return the nodes for which nobody upstream observes some unstable mode of A, and those for some decaying mode.
 
     Upstream of a node are itself and all whose messages can reach it. `squares`: H'H of each node (node, n, n). Nodes
-    that reach each other have the same nodes upstream, in one array `places`, which is checked once.
+    that reach each other have the same nodes upstream, in one array `upstream`, which is checked once.
     """
     without_unstable, without_decaying = [], []
     values = np.linalg.eigvals(a)
-    checked: dict[int, tuple[bool, bool]] = {}
-    for node, places in zip(graph.nodes, find_upstream_nodes(graph), strict=True):
-        if id(places) not in checked:
-            checked[id(places)] = _hides_modes(a, values, squares[places].sum(axis=0))
-        unstable, decaying = checked[id(places)]
+    hidden_modes: dict[int, tuple[bool, bool]] = {}
+    for node, upstream in zip(graph.nodes, find_upstream_nodes(graph), strict=True):
+        if id(upstream) not in hidden_modes:
+            hidden_modes[id(upstream)] = _hides_modes(a, values, squares[upstream].sum(axis=0))
+        unstable, decaying = hidden_modes[id(upstream)]
         if unstable:
             without_unstable.append(node)
         if decaying:
@@ -270,8 +271,9 @@ def _hides_modes(a: np.ndarray, values: np.ndarray, square: np.ndarray) -> tuple
         # Of lower rank, so that its smallest singular value is 0, where outputs hide the mode (test of Hautus).
         pencil = np.concatenate([(value * np.eye(len(a)) - a) / size, square])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < RANK:
-            unstable = abs(value) >= 1 - MODE
-            hides_unstable, hides_decaying = hides_unstable or unstable, hides_decaying or not unstable
+            is_unstable = abs(value) >= 1 - MODE
+            hides_unstable = hides_unstable or is_unstable
+            hides_decaying = hides_decaying or not is_unstable
     return hides_unstable, hides_decaying
 
 
@@ -296,8 +298,9 @@ def _check_noise_is_regular(where: str, noise: np.ndarray) -> None:
 
     `where`: the node, for errors. `noise`: the covariance R, judged as correlations; RANK: what counts as 0 of these.
     """
-    scale = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
-    if np.any(scale == 0) or np.linalg.eigvalsh(noise / np.outer(scale, scale))[0] < RANK:
+    deviation = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
+    has_zero = np.any(deviation == 0)
+    if has_zero or np.linalg.eigvalsh(noise / np.outer(deviation, deviation))[0] < RANK:
         raise fail(where, "measurement noise in every direction", "a singular covariance")
 
 
@@ -334,4 +337,6 @@ def _measures_alike_at_each_step(node: Node) -> bool:
     """
     if isinstance(node.sensor, OverTime) or isinstance(node.channel, OverTime):
         return False
-    return not np.any(np.asarray(second_order(node.channel.condition_on_arrival()).nominal.center)[:, :, :-1, :-1])
+    moments = second_order(node.channel.condition_on_arrival())
+    gain_covariance = np.asarray(moments.nominal.center)[:, :, :-1, :-1]
+    return not np.any(gain_covariance)

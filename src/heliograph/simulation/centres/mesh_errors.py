@@ -94,8 +94,9 @@ def _draw_arrivals(edges: MeshEdges, key: jax.Array, steps: np.ndarray) -> jax.A
         """Draw what arrives at step k: next states of the channels, and flags (node, rounds, degree)."""
         return edges.draw(state, key, k)
 
-    drawn: jax.Array = jax.lax.scan(draw_step, edges.init(key), jnp.asarray(steps))[1]
-    return drawn
+    arrivals: jax.Array
+    _, arrivals = jax.lax.scan(draw_step, edges.init(key), jnp.asarray(steps))
+    return arrivals
 
 
 def mesh_errors(
@@ -260,15 +261,15 @@ def _sum_known_information(mesh: Mesh, flags: np.ndarray, steps: Sequence[MeshSt
     `flags`: what arrives (step, node, rounds, degree). `steps`: with the information in each node's measurements.
     """
     count = len(mesh.nodes)
-    # From the last step back: the more exchanges follow, the more nodes' measurements can have come. `known`: sparse
+    # From the last step back: the more exchanges follow, the more nodes' measurements can have come. `reaches`: sparse
     # (node, node), a one where the data of the column's node reach the row's.
-    known: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
+    reaches: Any = scipy.sparse.csr_array(np.eye(count, dtype=np.int32))
     information: list[np.ndarray] = []
     for step, arrived in zip(reversed(steps), reversed(flags), strict=True):
-        for number in reversed(range(mesh.edges.rounds)):
-            known = _extend_known_data(known, mesh, arrived[:, number])
-        s = np.asarray(step.data.information)
-        information.append((known @ s.reshape(count, -1)).reshape(s.shape))
+        for round_number in reversed(range(mesh.edges.rounds)):
+            reaches = _extend_known_data(reaches, mesh, arrived[:, round_number])
+        information_of_nodes = np.asarray(step.data.information)
+        information.append((reaches @ information_of_nodes.reshape(count, -1)).reshape(information_of_nodes.shape))
     return information[::-1]
 
 
@@ -278,13 +279,13 @@ def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np
 
     `covariance` (node, n, n): any regular one. Others as of `Mesh.compute_step_without_estimates`.
     """
-    lossless = mesh.edges.lossless()
+    all_arrive = mesh.edges.lossless()
     measured = np.ones((len(mesh.senders), mesh.observation_model.size), dtype=bool)
     blocks = None
     if mesh.needs_joint:  # any blocks do, since they matter to gains alone
         degree, n = mesh.senders.shape[1], covariance.shape[-1]
         blocks = jnp.zeros((len(mesh.senders), degree, n, degree, n))
-    return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, lossless, u, k)
+    return mesh.compute_step_without_estimates(covariance, blocks, moments, measured, all_arrive, u, k)
 
 
 def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
@@ -293,12 +294,12 @@ def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
     `known`: sparse (node, node), a one where the data of the column's node reach the row's. `present`: which messages
     arrive in that exchange (node, degree).
     """
-    receiver, column = np.nonzero(present)
+    receiver, neighbour_index = np.nonzero(present)
     ones = np.ones(len(receiver), dtype=np.int32)
-    step = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, column])), shape=known.shape)
-    reached = known @ step  # step: a one where the row's node receives the column's
-    reached.data = np.minimum(reached.data, 1)
-    return reached
+    exchange = scipy.sparse.csr_array((ones, (receiver, mesh.senders[receiver, neighbour_index])), shape=known.shape)
+    extended = known @ exchange  # `exchange`: a one where the row's node receives the column's
+    extended.data = np.minimum(extended.data, 1)
+    return extended
 
 
 def freeze(
@@ -371,5 +372,5 @@ def _read_arrivals(mesh: Mesh, arrived: Any) -> Bool[np.ndarray, "horizon node r
     if flags.dtype != bool or flags.ndim != 4 or flags.shape[1:] != shape or not len(flags):
         raise fail("arrivals", f"a number of steps, or flags of shape (steps, {', '.join(map(str, shape))})",
                    f"{flags.dtype} of shape {flags.shape}")  # fmt: skip
-    arrives: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
-    return arrives
+    arrivals: np.ndarray = flags & mesh.edges.present[:, None]  # nothing comes where there is no neighbour
+    return arrivals

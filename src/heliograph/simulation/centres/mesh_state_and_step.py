@@ -108,11 +108,11 @@ def compute_information(observation: JointObservation, measured: Bool[jax.Array,
 
     `observation`: gain H and noise covariance R of each node; `measured`: which components came.
     """
-    # Rows of zeros without noise only pad a measurement.
-    real = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
+    # Rows of zeros without noise only pad a measurement: they are no numbers of it.
+    is_number = jnp.any(observation.gain != 0, axis=-1) | (jnp.einsum("imm->im", observation.noise) > 0)
     gain, noise = jnp.asarray(observation.gain), jnp.asarray(observation.noise)
-    weighted, information = jax.vmap(information_of)(gain, noise, real & measured)
-    _, complete = jax.vmap(information_of)(gain, noise, real)
+    weighted, information = jax.vmap(information_of)(gain, noise, is_number & measured)
+    _, complete = jax.vmap(information_of)(gain, noise, is_number)
     return MeasurementInformation(observation, weighted, information, complete)
 
 
@@ -127,8 +127,8 @@ def weigh_measurements(
     H_j, R_j: gain and noise covariance of node j; `present`: which components of z_j came.
     """
     observation = data.observation
-    off = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
-    return jnp.einsum("inm,im->in", data.weighted, off)  # weighted: H_j' R_j^-1
+    innovation = jnp.where(present, measured - observation.offset - observation.gain @ common, 0.0)
+    return jnp.einsum("inm,im->in", data.weighted, innovation)  # weighted: H_j' R_j^-1
 
 
 def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEstimates:
@@ -143,7 +143,8 @@ def widen_for_events(received: NeighbourEstimates, alpha: Array) -> NeighbourEst
     """
     degree, n = received.information.shape[1:3]
     factor = jnp.where(np.arange(degree) > 0, (1 + jnp.sqrt(alpha * n)) ** 2, 1.0)
-    return received._replace(traces=received.traces * factor, information=received.information / factor[:, None, None])
+    information = received.information / factor[:, None, None]
+    return received._replace(traces=received.traces * factor, information=information)
 
 
 def pull_to_neighbours(
@@ -187,7 +188,10 @@ def propagate_joint(
     """
     gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
     weights = measurement_weights(gains.gain, jnp.asarray(arrived))
+    # M, W S and W as (N, N) matrices, from their blocks (node, degree, n, n).
     blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights
-    m, ws, w = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
-    after = propagate_joint_covariance(joint.reshape(size, size), m, gains.innovation, motion.noise, ws, w)
-    return jnp.asarray(after).reshape(joint.shape)
+    transition, noise_factor, weight_matrix = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
+    covariance = propagate_joint_covariance(
+        joint.reshape(size, size), transition, gains.innovation, motion.noise, noise_factor, weight_matrix
+    )
+    return jnp.asarray(covariance).reshape(joint.shape)

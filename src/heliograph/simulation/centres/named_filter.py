@@ -65,7 +65,7 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
     """Return the filter of this name at the centre: a central filter, or the one of a fusion by reports."""
     fused = network.fused[name]
     if isinstance(fused, AbstractFilter):
-        names = [f"{node}_{part}" for node in network.names for part in network.nodes[node].received_names]
+        names = [f"{node}_{number}" for node in network.names for number in network.nodes[node].received_names]
         # A central filter receives the numbers of all nodes, or none at all.
         return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
     if not fused.rule.uses_reports:
@@ -82,10 +82,10 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
     uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
     for age in range(uplinks.delay.shape[1]):
-        late = f"_{age}_late" if age else ""  # age: steps between sending and arrival
+        suffix = f"_{age}_late" if age else ""  # age: steps between sending and arrival
         for node, link, size in zip(nodes, fusion.links(nodes), uplinks.received, strict=True):
-            parts = network.states if link.channel is None else [f"report{i}" for i in range(size)]
-            names += [f"{node}_{part}{late}" for part in parts]
+            numbers = network.states if link.channel is None else [f"report{i}" for i in range(size)]
+            names += [f"{node}_{number}{suffix}" for number in numbers]
     return names
 
 
@@ -97,6 +97,6 @@ def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFil
     names = list(network.nodes[node].received_names)
     for sender in (network.meshes[name].neighbours or {})[node]:
         pairs = [f"{a}_{b}" for a in network.states for b in network.states]
-        parts = [f"mean_{s}" for s in network.states] + [f"covariance_{pair}" for pair in pairs]
-        names += [f"{sender}_{part}" for part in (*parts, *network.nodes[sender].received_names)]
+        numbers = [f"mean_{state}" for state in network.states] + [f"covariance_{pair}" for pair in pairs]
+        names += [f"{sender}_{number}" for number in (*numbers, *network.nodes[sender].received_names)]
     return NamedFilter(node, node_filter(network, name, node), tuple(names))

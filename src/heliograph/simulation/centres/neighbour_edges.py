@@ -77,18 +77,19 @@ class MeshEdges(Module):
             The channels' states after the step, and which messages arrive (node, rounds, degree): flags, or their ages
             in steps and -1 of none where messages may be late. A node's own message, at 0, always arrives.
         """
-        rounds = []
+        arrivals_by_round = []
         # One exchange after another; the channels go on from one to the next.
-        for number in range(self.rounds):
-            arrives, following = jnp.asarray(self.lossless()[:, 0]), []
+        for round_number in range(self.rounds):
+            arrives, next_states = jnp.asarray(self.lossless()[:, 0]), []
             for group, state in zip(self.groups, states, strict=True):
-                after, by_edge = self._draw_group(group, state, key, k, k * self.rounds + number)
-                following.append(after)
+                exchange = k * self.rounds + round_number  # its number in the run
+                after, by_edge = self._draw_group(group, state, key, k, exchange)
+                next_states.append(after)
                 # Each edge of the group has its place in the flattened (node, degree).
                 arrives = arrives.ravel().at[self.slots[group.places]].set(by_edge).reshape(arrives.shape)
-            states = tuple(following)
-            rounds.append(arrives)
-        return states, jnp.stack(rounds, axis=1)
+            states = tuple(next_states)
+            arrivals_by_round.append(arrives)
+        return states, jnp.stack(arrivals_by_round, axis=1)
 
     def _draw_group(
         self, group: ChannelGroup, state: PyTree, key: jax.Array, k: jax.Array, count: jax.Array
@@ -126,9 +127,9 @@ class MeshEdges(Module):
 
         Where messages may be late they are ages: 0 of a neighbour, -1 where there is none.
         """
-        module = library(self.present)  # NumPy outside of a trace, JAX inside
-        flags = module.where(self.present, 0, -1) if self.past else self.present
-        repeated: np.ndarray = module.repeat(flags[:, None], self.rounds, axis=1)
+        xp = library(self.present)  # NumPy outside a trace, JAX inside
+        flags = xp.where(self.present, 0, -1) if self.past else self.present
+        repeated: np.ndarray = xp.repeat(flags[:, None], self.rounds, axis=1)
         return repeated
 
     def read_recorded(
@@ -168,8 +169,8 @@ class MeshEdges(Module):
 
         Raises ValueError for an age above `past`, the most by which a message may be late. `neighbours`: of this node.
         """
-        recorded = report.values if isinstance(report, SentReports) else report
-        values = array(f"reports of node {node!r}", recorded, (steps, self.rounds * neighbours), missing=True)
+        numbers = report.values if isinstance(report, SentReports) else report
+        values = array(f"reports of node {node!r}", numbers, (steps, self.rounds * neighbours), missing=True)
         values = values.reshape(steps, self.rounds, neighbours)
         if self.past and not np.isin(values[~np.isnan(values)], np.arange(self.past + 1)).all():
             expected = f"ages of what arrives, from 0 to {self.past} steps, NaN where nothing does"
@@ -187,7 +188,8 @@ def build_edges(fusion: Fusion, graph: Graph) -> MeshEdges:
         return MeshEdges((), np.zeros(0, dtype=int), graph.present, fusion.rounds)
     links = links_by_edge(fusion.link, graph)
     # One channel under many names is checked once.
-    for name, channel in {id(c): (name, c) for name, c in links.items()}.values():
+    distinct = {id(channel): (name, channel) for name, channel in links.items()}
+    for name, channel in distinct.values():
         check_edge(f"link {name!r}" if isinstance(fusion.link, Mapping) else "link between neighbours", channel)
     # Places of the edges in the flattened (node, degree), without place 0, the node itself.
     slots = np.flatnonzero(graph.present & (np.arange(graph.present.shape[1]) > 0))
@@ -201,9 +203,8 @@ def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[s
     `link`: one for all edges, or a link for each by this name.
     """
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
-    return dict(
-        zip(names, spread_over_names("links between neighbours", link, names, "edge SENDER to RECEIVER"), strict=True)
-    )
+    title, label = "links between neighbours", "edge SENDER to RECEIVER"
+    return dict(zip(names, spread_over_names(title, link, names, label), strict=True))
 
 
 def check_edge(what: str, link: Channel) -> None:
@@ -211,8 +212,8 @@ def check_edge(what: str, link: Channel) -> None:
     instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for step in unstack(link):
         # Delays that are the same for all, or stamped on the message.
-        late = find_delay(step)
-        if late is not None and not (late.constant or late.timestamped):
+        delay = find_delay(step)
+        if delay is not None and not (delay.constant or delay.timestamped):
             raise fail(what, "delays that the receiver knows (timestamped=True)", "others")
         # Inside losses and delays, and inside the losses of each mode: a link that changes nothing.
         _, inside = _split_losses_from_link(step, Erasure | DelayedLink)
@@ -265,8 +266,9 @@ def find_loss_decay(channel: Channel | None) -> float | None:
     chances = [find_arrival_probability(mode) for mode in inside.maps]
     if inside.memory.name is not None or None in chances:
         return None
-    losses = 1 - float(arrival) * np.array(chances, dtype=float)  # l, by mode
-    return float(np.abs(np.linalg.eigvals(losses[:, None] * np.asarray(inside.memory.transition))).max())
+    loss_probabilities = 1 - float(arrival) * np.array(chances, dtype=float)  # l, by mode
+    losses_in_a_row = loss_probabilities[:, None] * np.asarray(inside.memory.transition)  # diag(l) P
+    return float(np.abs(np.linalg.eigvals(losses_in_a_row)).max())
 
 
 def _is_perfect(channel: AbstractRandomAffine) -> bool:
@@ -274,5 +276,5 @@ def _is_perfect(channel: AbstractRandomAffine) -> bool:
     if channel.inputs != channel.outputs:
         return False
     moments = second_order(channel.condition_on_arrival())
-    same = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
-    return same and not np.any(moments.nominal.center)
+    is_identity = np.array_equal(moments.mean_gain, np.eye(channel.inputs)) and not np.any(moments.offset)
+    return is_identity and not np.any(moments.nominal.center)

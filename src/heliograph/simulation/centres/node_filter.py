@@ -73,8 +73,9 @@ class NodeFilter(AbstractSizedFilter):
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
         # The state of a mesh of the node and its neighbours; the first axis of `way`, ages, is empty.
-        alone = start._replace(way=MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n))))
-        return NodeState(alone, jnp.zeros(len(self.inputs)), alone)
+        no_messages = MessagesOnTheWay(jnp.zeros((0, count, n)), jnp.zeros((0, count, n, n)))
+        state = start._replace(way=no_messages)
+        return NodeState(state, jnp.zeros(len(self.inputs)), state)
 
     @predicts
     def predict(self, state: NodeState, u: ArrayLike = (), k: Step = 0) -> NodeState:
@@ -115,28 +116,31 @@ class NodeFilter(AbstractSizedFilter):
     def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements in z of the node and its neighbours, and `before` with their estimates in z too.
 
-        Rows of these: the node's own, then its neighbours'. `measured`: how many numbers each measures. Where no
+        Rows of these: the node's own, then its neighbours'. `measurement`: how many numbers each measures. Where no
         message came, the mean is NaN, and the covariance any regular one: the node's own.
         """
         n, begin = len(self.states), self.measured[0]  # where the next neighbour's numbers begin in z
-        sensed, means, covariances = [z[:begin]], [before.mean[0]], [before.covariance[0]]
+        measurements = [z[:begin]]  # the node's own first
+        means, covariances = [before.mean[0]], [before.covariance[0]]
         # Of each neighbour mean (n), covariance (n n) and measurement (size).
         for size in self.measured[1:]:
-            mean, covariance, measured = jnp.split(z[begin : begin + n + n * n + size], [n, n + n * n])
+            mean, covariance, measurement = jnp.split(z[begin : begin + n + n * n + size], [n, n + n * n])
             begin += n + n * n + size
-            sensed.append(measured)
+            measurements.append(measurement)
             arrives = ~jnp.any(jnp.isnan(covariance))
             means.append(jnp.where(arrives, mean, jnp.nan))
             covariances.append(jnp.where(arrives, symmetrize(covariance.reshape(n, n)), covariances[0]))
-        return sensed, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
+        return measurements, before._replace(mean=jnp.stack(means), covariance=jnp.stack(covariances))
 
     def _step_from(self, before: MeshState, z: jax.Array, u: Array, k: Step) -> NodeState:
         """Return the state after step k from `before` with z, the node's measurement and its neighbours' messages."""
-        sensed, all_nodes = self._split_measurements(z, before)
+        measurements, state_with_messages = self._split_measurements(z, before)
         # What did not come is NaN, so that all is said to arrive.
-        everything = jnp.ones((1, 1, len(sensed)), dtype=bool)
-        now, _ = self.mesh.step(all_nodes, [x[None] for x in sensed], everything, jnp.asarray(u), jnp.asarray(k))
-        return NodeState(before, u, now)
+        everything = jnp.ones((1, 1, len(measurements)), dtype=bool)
+        after, _ = self.mesh.step(
+            state_with_messages, [x[None] for x in measurements], everything, jnp.asarray(u), jnp.asarray(k)
+        )
+        return NodeState(before, u, after)
 
 
 def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
@@ -244,7 +248,7 @@ def node_network(network: Network, node: str) -> Network:
         raise fail("node", f"one of fusion {name!r}: {', '.join(nodes)}", repr(node))
     senders = (network.meshes[name].neighbours or {})[node]
     received = {j: _count_message_numbers(len(network.states), network.nodes[j].received) for j in senders}
-    parts = {j: ReceivingNode({}, size, (), False) for j, size in received.items()}
+    parts = {j: ReceivingNode(filters={}, received=size, outputs=(), complete=False) for j, size in received.items()}
     return Network(network.plant, {node: network.nodes[node], **parts}, {name: node_filter(network, name, node)})
 
 

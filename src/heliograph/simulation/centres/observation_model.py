@@ -54,15 +54,16 @@ def _linearise_observation(
     M = E[G] C and o = E[G] E v + E n; the covariance is that of noise through the mean gain, and of the gain's spread.
     `mean` and `covariance`: of the plant's state x.
     """
-    c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
-    signal = c @ mean + sensor.noise.mean  # E y, y = C x + v
-    # E (y, 1)(y, 1)', of which the random gains and the channel's noise make noise of z.
-    second = augmented_second_moment(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
+    matrix, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
+    signal = matrix @ mean + sensor.noise.mean  # E y, y = C x + v
+    # E (y, 1)(y, 1)', of which the random gains and the channel's noise make noise of z: Cov((G - E G) y + n).
+    second = matrix @ covariance @ matrix.T + noise + jnp.outer(signal, signal)
+    signal_moments = augmented_second_moment(second, signal, last=1.0)
     gain = jnp.asarray(channel.mean_gain)
-    spread = channel.nominal.evaluate_center(second, jnp.ones(len(gain), dtype=bool))
-    return JointObservation(
-        gain=gain @ c, offset=gain @ sensor.noise.mean + channel.offset, noise=gain @ noise @ gain.T + spread
-    )
+    all_arrive = jnp.ones(len(gain), dtype=bool)
+    spread = channel.nominal.evaluate_center(signal_moments, all_arrive)
+    offset = gain @ sensor.noise.mean + channel.offset
+    return JointObservation(gain=gain @ matrix, offset=offset, noise=gain @ noise @ gain.T + spread)
 
 
 class SeparateObservations(Module):
@@ -87,14 +88,15 @@ class SeparateObservations(Module):
         of the longest measurement, to which all are padded.
         """
         m, n = self.size, len(mean)
-        parts = []
+        models_by_group = []
         for i, group in enumerate(self.groups):
             if group is None:
                 shapes = (m, n), (m,), (m, m)
-                parts.append(JointObservation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
+                models_by_group.append(JointObservation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
             else:
-                parts.append(group.observe(mean, covariance, k, m))
-        return JointObservation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+                models_by_group.append(group.observe(mean, covariance, k, m))
+        joined = (jnp.concatenate(fields) for fields in zip(*models_by_group, strict=True))
+        return JointObservation(*(field[self.order] for field in joined))
 
 
 class SharedObservation(Module):

@@ -70,10 +70,10 @@ class RelayTree:
         if values.shape[-2:] != (nodes, n):
             raise fail("estimates of the leaves", f"shape (..., {nodes}, {n})", f"shape {values.shape}")
         for weights in self.weights:  # (relay, n, child, n), level after level up to the root
-            lacking = len(weights) * self.degree - values.shape[-2]
-            filled = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, lacking), (0, 0)])
-            apart = filled.reshape(*filled.shape[:-2], len(weights), self.degree, n)
-            values = np.einsum("raib,...rib->...ra", weights, apart)
+            missing = len(weights) * self.degree - values.shape[-2]
+            padded = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, missing), (0, 0)])
+            by_relay = padded.reshape(*padded.shape[:-2], len(weights), self.degree, n)
+            values = np.einsum("raib,...rib->...ra", weights, by_relay)
         return np.asarray(values[..., 0, :])
 
 
@@ -105,7 +105,7 @@ def relay_tree(
 
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
-    check_count("degree of a tree", degree, 2)
+    check_count("degree of a tree", degree, least=2)
     function("node", node, "the numbers of one leaf that returns a Node")
     count, steps = _count_leaves(numbers), check_count("horizon", horizon)
     with jax.enable_x64(True):
@@ -227,7 +227,8 @@ def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray
     groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
     outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
     weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
-    return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *(error for _, error in outputs))
+    relay_errors = [error for _, error in outputs]
+    return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *relay_errors)
 
 
 @quickly_compiled

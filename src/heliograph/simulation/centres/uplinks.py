@@ -96,10 +96,13 @@ class Uplinks(Module):
         """Return the state with no report in transit from the nodes to the centre."""
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
-        begin_all = eqx.filter_vmap(
-            lambda quantizer: quantizer.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes
-        )
-        quantizers = () if self.quantizers is None else begin_all(self.quantizers)
+
+        def init_quantizer(quantizer: AbstractQuantizer) -> PyTree:
+            """Return the initial state of one node's quantizer."""
+            return quantizer.init(self.n)
+
+        init_all = eqx.filter_vmap(init_quantizer, in_axes=(eqx.if_array(0),), axis_size=nodes)
+        quantizers = () if self.quantizers is None else init_all(self.quantizers)
         return ReportsInTransit(values, delays=jnp.zeros((ages - 1, nodes), dtype=int), quantizers=quantizers)
 
     def draw(self, key: jax.Array, k: jax.Array) -> UplinkDraws:
@@ -219,8 +222,9 @@ class Uplinks(Module):
         """
         values = jnp.concatenate([sent[None], state.values])
         delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])
-        due = delays == np.arange(len(values))[:, None]  # those whose age is their delay
-        return state._replace(values=values[:-1], delays=delays[:-1]), jnp.where(due[..., None], values, jnp.nan)
+        is_due = delays == np.arange(len(values))[:, None]  # those whose age is their delay
+        arriving = jnp.where(is_due[..., None], values, jnp.nan)
+        return state._replace(values=values[:-1], delays=delays[:-1]), arriving
 
 
 def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -229,10 +233,10 @@ def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Ar
     `delay` (channel, ages): probability of each delay in steps.
     """
 
-    def draw_link(channel: Channel, source: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draw one channel, seeded by its number `source`, and a delay by the probabilities `law`."""
+    def draw_link(channel: Channel, source: jax.Array, probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw one channel, seeded by its number `source`, and a delay by its `probabilities`."""
         channel_key, delay_key = jax.random.split(draw_key(key, k, source, CHANNEL))
-        return at(channel, k).sample(channel_key), jax.random.choice(delay_key, len(law), p=law)
+        return at(channel, k).sample(channel_key), jax.random.choice(delay_key, len(probabilities), p=probabilities)
 
     draw_links = eqx.filter_vmap(draw_link, in_axes=(eqx.if_array(0), 0, 0))
     matrices, delays = draw_links(group.channel, group.checksums, delay)
@@ -262,24 +266,29 @@ def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
 
 
 def _make_link_models(
-    known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
+    moments_by_node: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray
 ) -> ReportModel | OverTime:
     """Return the centre's model of the uplinks, one for each step if any varies.
 
-    `known`: moments of each node's channel. `received`: how many numbers arrive of its report. `error` (node, n): bound
-    on what its quantizer changes.
+    `moments_by_node`: of each node's channel. `received`: how many numbers arrive of its report. `error` (node, n):
+    bound on what its quantizer changes.
     """
-    model: ReportModel | OverTime = at_each_step(lambda *links: _gather_link_moments(links, received, error), *known)
+
+    def gather(*links: SecondOrder) -> ReportModel:
+        """Return the model of one step, from the moments of each node's link."""
+        return _gather_link_moments(links, received, error)
+
+    model: ReportModel | OverTime = at_each_step(gather, *moments_by_node)
     return model
 
 
-def _gather_link_moments(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
+def _gather_link_moments(links: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> ReportModel:
     """Return the moments of all uplinks as arrays, padded with zeros where fewer numbers arrive of a node's report.
 
-    Arguments as of `_make_link_models`, `known` at one step.
+    `links`: moments of each node's channel at one step; else as `_make_link_models`.
     """
     gains, offsets, spreads = [], [], []
-    for link, size in zip(known, received, strict=True):
+    for link, size in zip(links, received, strict=True):
         padding = (0, max(received) - size)
         gains.append(np.pad(link.mean_gain, (padding, (0, 0))))
         offsets.append(np.pad(link.offset, padding))

@@ -78,25 +78,26 @@ def examine_innovations(
     return InnovationTests(nis, correlation, p_value)
 
 
-def _test_correlation(white: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
+def _test_correlation(normalised: Float[np.ndarray, "rows m"], exact: bool) -> tuple[float, float]:
     """Return the correlation r_1 of innovations one message apart, and the p-value of r_1, ..., r_10 together.
 
     r_l = sum_k u_k u_(k-l) / sum_k u_k^2. Without memory the sum over l of the squares, each in units of its variance,
     is chi-squared. The variance is that of Ljung and Box where innovations are independent, else estimated.
 
     Args:
-        white: innovations u in units of their claimed deviation, NaN where none is; of few rows fewer lags are tested.
+        normalised: innovations u in units of their claimed deviation, NaN where none is; of few rows fewer lags are
+            tested.
         exact: whether innovations are independent if their claim is true.
     """
-    rows, count = len(white), int(np.sum(~np.isnan(white)))
+    rows, count = len(normalised), int(np.sum(~np.isnan(normalised)))
     lags = min(LAGS, rows // 10)  # LAGS: 10
-    power = np.nansum(white**2)
-    products = [white[lag:] * white[:-lag] for lag in range(1, lags + 1)]
-    r = np.array([np.nansum(product) for product in products]) / power
+    power = np.nansum(normalised**2)
+    products = [normalised[lag:] * normalised[:-lag] for lag in range(1, lags + 1)]
+    correlations = np.array([np.nansum(product) for product in products]) / power
     if exact:
-        squared = count * (rows + 2) * r**2 / (rows - np.arange(1, lags + 1))
+        squares = count * (rows + 2) * correlations**2 / (rows - np.arange(1, lags + 1))
     else:
         sums = [average_correlated(np.nansum(product, axis=1)) for product in products]
-        squared = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
-    p_value = scipy.special.gammaincc(lags / 2, np.sum(squared) / 2)  # upper tail of chi-squared, `lags` degrees
-    return float(r[0]), float(p_value)
+        squares = np.array([(mean / error) ** 2 if error > 0 else 0.0 for mean, error in sums])
+    p_value = scipy.special.gammaincc(lags / 2, np.sum(squares) / 2)  # upper tail of chi-squared, `lags` degrees
+    return float(correlations[0]), float(p_value)

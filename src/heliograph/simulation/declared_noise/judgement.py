@@ -201,8 +201,8 @@ def judge_declared_links(
     z, u = (np.asarray(rows)[:MOST] for rows in check_data(filter, data, inputs))
     if not isinstance(filter, ToldFilter):
         return ()
-    judged = [_judge_link(filter, link, z, u)[0] for link in list_links_declaring_noise(filter)]
-    return tuple(judgement for judgement in judged if judgement is not None)
+    judgements = [_judge_link(filter, link, z, u)[0] for link in list_links_declaring_noise(filter)]
+    return tuple(judgement for judgement in judgements if judgement is not None)
 
 
 def _judge_link(
@@ -242,16 +242,16 @@ class _DeclaredVariances(eqx.Module):
 
 
 def _compute_declared_variances(
-    place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
+    link_place: ReceivedLinkPlace, z: Float[np.ndarray, "steps received"]
 ) -> Float[np.ndarray, "steps outputs"]:
     """Return the variances that the message of each row declares, NaN where one of its numbers is missing.
 
     Typical numbers stand for missing ones meanwhile, so that the law has a variance for every row.
     """
-    numbers = z[:, place.numbers]
+    numbers = z[:, link_place.numbers]
     complete = ~np.isnan(numbers).any(axis=1)[:, None]
-    filled = np.where(complete, numbers, np.asarray(place.told.typical))
-    variances = np.asarray(over_runs(_DeclaredVariances(place.told), filled))
+    with_typical = np.where(complete, numbers, np.asarray(link_place.told.typical))
+    variances = np.asarray(over_runs(_DeclaredVariances(link_place.told), with_typical))
     return np.asarray(np.where(complete, variances, np.nan))
 
 
@@ -371,28 +371,26 @@ def _describe_bias(bias: DeclaredBias, unit: str) -> list[str]:
     """Return lines on how large a bias is, if it matters (LEAST: 1.1), its memory in this unit, and what to do."""
     lines = []
     if bias.times_white_low > np.sqrt(LEAST):
-        bounded = bias.times_white < 2 * bias.times_white_low
-        times = f"{_two_digits(bias.times_white)}" if bounded else f"at least {_two_digits(bias.times_white_low)}"
+        is_bounded = bias.times_white < 2 * bias.times_white_low
+        times = f"{_two_digits(bias.times_white)}" if is_bounded else f"at least {_two_digits(bias.times_white_low)}"
         lines.append(f"the declared deviation is {times} times the white part of the error")
-    ends = f"{_two_digits(bias.time_low)} to {_two_digits(bias.time_high)}" if np.isfinite(bias.time_high) else (
-        f"at least {_two_digits(bias.time_low)}")  # fmt: skip
-    lines.append(
-        f"the error has a memory of about {_two_digits(bias.time)} {unit} ({ends}): give it a bias state (with_bias)"
-    )
+    low = _two_digits(bias.time_low)
+    interval = f"{low} to {_two_digits(bias.time_high)}" if np.isfinite(bias.time_high) else f"at least {low}"
+    memory = f"the error has a memory of about {_two_digits(bias.time)} {unit} ({interval})"
+    lines.append(f"{memory}: give it a bias state (with_bias)")
     return lines
 
 
-def _describe_scale(one: DeclaredClass, several: bool) -> list[str]:
+def _describe_scale(declared_class: DeclaredClass, are_several: bool) -> list[str]:
     """Return a line on how much too large or small the variances of a class of messages are; none if they are right."""
-    if np.isnan(one.scale) or (one.scale_low < LEAST and one.scale_high > 1 / LEAST):
+    if np.isnan(declared_class.scale) or (declared_class.scale_low < LEAST and declared_class.scale_high > 1 / LEAST):
         return []
-    times, low, high = one.scale, one.scale_low, one.scale_high
-    kind = "small"
-    if one.scale < 1:
-        times, low, high, kind = 1 / one.scale, 1 / one.scale_high, 1 / one.scale_low, "large"
-    of = f" from {one.low:.3g} to {one.high:.3g}" if several else ""
+    times, low, high, kind = declared_class.scale, declared_class.scale_low, declared_class.scale_high, "small"
+    if times < 1:
+        times, low, high, kind = 1 / times, 1 / high, 1 / low, "large"
+    range_of_class = f" from {declared_class.low:.3g} to {declared_class.high:.3g}" if are_several else ""
     factor = f"{_two_digits(times)} times too {kind} ({_two_digits(low)} to {_two_digits(high)})"
-    return [f"declared variances{of} are {factor}; scaled so, the innovations pass"]
+    return [f"declared variances{range_of_class} are {factor}; scaled so, the innovations pass"]
 
 
 def _two_digits(value: float) -> str:

@@ -19,7 +19,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import TIME_STEP, AbstractPlant
 from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import (
     AbstractToldMap,
@@ -129,8 +129,9 @@ class LinkWithScaledNoise(eqx.Module):
         """Return the link of these declared numbers, with its noise scaled."""
         link = self.make(numbers)
         # Class of the message: how many `edges` the mean logarithm of its variances is above.
-        size = jnp.mean(jnp.log(list_noise_variances(link)))
-        scale = jnp.asarray(self.scales)[jnp.sum(size > jnp.asarray(self.edges))]
+        log_variance = jnp.mean(jnp.log(list_noise_variances(link)))
+        class_number = jnp.sum(log_variance > jnp.asarray(self.edges))
+        scale = jnp.asarray(self.scales)[class_number]
 
         def rescale(leaf: object) -> object:
             """Return a noise with its covariance scaled; anything else as it is."""
@@ -153,16 +154,19 @@ def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
 
 @in_float64
 def _declares_noise(affine: ToldMap) -> bool:
-    """Return whether a map takes its Gaussian noise from the number it is told: moving the number moves the noise.
+    """Return whether a map takes its Gaussian noise from the number it is told: another number gives another noise.
 
-    ALMOST: by which part of itself the number is moved. A map that is told its gain declares no noise.
+    ALMOST: by which part of itself the number is changed. A map that is told its gain declares no noise.
     """
     if isinstance(affine.make, ToldGainHop):
         return False
     typical = np.asarray(affine.typical)
-    noises, moved = (_list_link_noises(affine.believed(numbers)) for numbers in (typical, typical * (1 + ALMOST)))
-    changes = any(not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, moved, strict=True))
-    return changes and all(isinstance(noise, Gaussian) for noise in noises)
+    noises = _list_link_noises(affine.believed(typical))
+    changed_noises = _list_link_noises(affine.believed(typical * (1 + ALMOST)))
+    has_changed = any(
+        not np.array_equal(a.covariance, b.covariance) for a, b in zip(noises, changed_noises, strict=True)
+    )
+    return has_changed and all(isinstance(noise, Gaussian) for noise in noises)
 
 
 def _list_link_noises(link: AbstractRandomAffine) -> list[AbstractNoise]:
@@ -247,11 +251,13 @@ def refit_with_bias(declared: DeclaredRows, scales: Refit) -> Refit:
 
     `scales`: the best without a bias, from which the search begins, once for each memory of TIMES in steps.
     """
-    step = find_median_step(declared)
-    white = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
+    time_step = find_median_step(declared)
+    start_scales = scales.logs - np.log(4)  # the search begins with three quarters of the variance in the bias
     # Behind the scales: the bias's deviation over the root of its memory, and its memory.
-    starts = [np.append(white, [(np.mean(scales.logs) - np.log(step)) / 2, np.log(time * step)]) for time in TIMES]
-    return max((_maximise_likelihood(declared, start) for start in starts), key=lambda refit: refit.likelihood)
+    log_deviation = (np.mean(scales.logs) - np.log(time_step)) / 2
+    starts = [np.append(start_scales, [log_deviation, np.log(memory * time_step)]) for memory in TIMES]
+    refits = [_maximise_likelihood(declared, start) for start in starts]
+    return max(refits, key=lambda refit: refit.likelihood)
 
 
 def find_median_step(declared: DeclaredRows) -> float:
@@ -274,9 +280,10 @@ def find_interval_end(declared: DeclaredRows, best: Refit, number: int, sign: in
     constrained = best
 
     def compute_excess_fall(distance: float) -> float:
-        """Return by how much the log-likelihood falls at this distance from the best number, less REACH, 1.92 nats.
+        """Return by how much the log-likelihood falls at this distance from the maximum, less REACH, 1.92 nats.
 
-        All other numbers are at their best there. `number`: which one it is; `sign`: in which direction.
+        The distance is one of the logarithm with index `number`, upwards for `sign` 1; all others are at their best.
+        Closed over: `best`, the maximum; `declared`, the filter and its recording.
         """
         nonlocal constrained  # each search starts from the last one's result
         start = constrained.logs.copy()
@@ -313,27 +320,38 @@ def _maximise_likelihood(
     if has_bias:
         time_step = find_median_step(declared)
         low[-1], high[-1] = np.log(FAST * time_step), np.log(SLOW * len(declared.z) * time_step)
-    likelihood = RefitLikelihood(declared)
-    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
-
-    def compute_loss(logs: Float[np.ndarray, " free"]) -> tuple[float, Float[np.ndarray, " free"]]:
-        """Return -l and its slope by central differences, l the log-likelihood; all points in one call.
-
-        `logs`: the free ones of all logarithms, the others staying as in `start`. `moves`: a row for each free one,
-        which moves it by DIFFERENCE. A likelihood that is no number counts as LOST nats below any.
-        """
-        all_logs = start.copy()
-        all_logs[free] = logs
-        points = np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)])
-        points = np.clip(points, low, high)  # flat beyond the limits
-        values = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
-        above, below = np.split(values[1:], 2)
-        return float(values[0]), (above - below) / (2 * DIFFERENCE)
-
+    fixed_arguments = RefitLikelihood(declared), start, free, (low, high)
     if not free.any():  # the only number is fixed: there is nothing to search
-        loss, _ = compute_loss(start[free])
+        loss, _ = _compute_loss(start[free], *fixed_arguments)
         return Refit(start, -loss)
-    found = scipy.optimize.minimize(compute_loss, start[free], jac=True, method="BFGS", options={"gtol": SLOPE})
+    found = scipy.optimize.minimize(
+        _compute_loss, start[free], args=fixed_arguments, jac=True, method="BFGS", options={"gtol": SLOPE}
+    )
     logs = start.copy()
     logs[free] = found.x
     return Refit(np.clip(logs, low, high), -float(found.fun))
+
+
+def _compute_loss(
+    logs: Float[np.ndarray, " free"],
+    likelihood: RefitLikelihood,
+    start: Float[np.ndarray, " numbers"],
+    free: Bool[np.ndarray, " numbers"],
+    limits: tuple[Float[np.ndarray, " numbers"], Float[np.ndarray, " numbers"]],
+) -> tuple[float, Float[np.ndarray, " free"]]:
+    """Return minus the log-likelihood, and its slope by central differences; all points in one call.
+
+    Args:
+        logs: the free logarithms.
+        likelihood: of all logarithms; one that is NaN counts as -LOST nats.
+        start: all logarithms, of which those that are not free stay.
+        free: which are free.
+        limits: lowest and highest values of all, beyond which the likelihood is flat.
+    """
+    all_logs = start.copy()
+    all_logs[free] = logs
+    moves = DIFFERENCE * np.eye(len(start))[free]  # one row for each free number, which moves that number alone
+    points = np.clip(np.stack([all_logs, *(all_logs + moves), *(all_logs - moves)]), *limits)
+    losses = -np.maximum(np.nan_to_num(over_runs(likelihood, points), nan=-LOST), -LOST)
+    above, below = np.split(losses[1:], 2)
+    return float(losses[0]), (above - below) / (2 * DIFFERENCE)

@@ -37,21 +37,23 @@ def find_largest_usable_deviation(filter: AbstractFilter) -> float:
     if isinstance(transform, Cubature):
         return min(WIDE, float(np.pi / n**0.5))
     if isinstance(transform, Unscented):
-        return min(WIDE, float(np.pi / (float(transform.alpha) * (n + float(transform.kappa)) ** 0.5)))
+        alpha, kappa = float(transform.alpha), float(transform.kappa)
+        return min(WIDE, float(np.pi / (alpha * (n + kappa) ** 0.5)))
     return WIDE
 
 
 def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
     """Yield a line for each angle of which a filter starts with less knowledge than it can use."""
-    lines: dict[tuple[str, str, float], list[str]] = {}
+    nodes_by_angle: dict[tuple[str, str, float], list[str]] = {}
     for node, label, filter in _yield_filters_with_angles(network):
         covariance = np.asarray(filter.estimate(filter.init()).covariance)
         for name, deviation in _yield_deviations(network, filter, covariance):
             if deviation > find_largest_usable_deviation(filter):
-                lines.setdefault((name, label, float(deviation)), []).append(node)
-    for (name, label, known), nodes in lines.items():
-        where = f"{label!r} of {', '.join(map(repr, nodes[:3]))}{', ...' if len(nodes) > 3 else ''}"
-        yield f"wide angle: {where} starts with {name!r} known to +- {known:.2g} rad; {REMEDY}"
+                nodes_by_angle.setdefault((name, label, float(deviation)), []).append(node)
+    for (name, label, deviation_at_start), nodes in nodes_by_angle.items():
+        first_nodes = ", ".join(map(repr, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
+        known = f"{name!r} known to +- {deviation_at_start:.2g} rad"
+        yield f"wide angle: {label!r} of {first_nodes} starts with {known}; {REMEDY}"
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
@@ -61,9 +63,9 @@ def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]
         for name, deviation in _yield_deviations(network, filter, covariance):
             wide = np.flatnonzero(deviation > find_largest_usable_deviation(filter))
             if wide.size:
-                known = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
+                finding = f"{name!r} is known to +- {deviation[wide].max():.2g} rad"
                 rows = f"in {wide.size} of {len(deviation)} rows, first in row {wide[0] + 1}"
-                yield f"{node}/{label}: {known} {rows}; {REMEDY}"
+                yield f"{node}/{label}: {finding} {rows}; {REMEDY}"
 
 
 @readable
@@ -82,48 +84,48 @@ class WideAngles:
     """
 
     def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
+        """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
         instance("filter", filter, AbstractFilter, "a filter")
-        used = None if filter.claim == "none" else filter.angles_used()
-        self.states = {} if used is None else {i: filter.states[i] for i in used.states}
+        angles = None if filter.claim == "none" else filter.angles_used()
+        self.states = {} if angles is None else {i: filter.states[i] for i in angles.states}
         if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
-        self.received = {} if used is None else {i: names[i] for i in used.received}
-        self._most = find_largest_usable_deviation(filter) if self.states else np.inf
+        self.received = {} if angles is None else {i: names[i] for i in angles.received}
+        self._largest_usable = find_largest_usable_deviation(filter) if self.states else np.inf
 
     def doubt_unit(self, values: Float[np.ndarray, "rows m"]) -> list[tuple[int, str]]:
         """Return a row and a line for each received angle that is beyond a full turn (TURN) for the first time.
 
         `received`: names of the angles of which nothing was said yet, by component; one that is said is taken out.
         """
-        said = []
+        doubts = []
         for i in list(self.received):
-            far = np.flatnonzero(np.abs(values[:, i]) > TURN)
-            if far.size:
-                said.append((int(far[0]), doubt_degrees(self.received.pop(i), values[far[0], i])))
-        return said
+            rows_beyond = np.flatnonzero(np.abs(values[:, i]) > TURN)
+            if rows_beyond.size:
+                doubts.append((int(rows_beyond[0]), doubt_degrees(self.received.pop(i), values[rows_beyond[0], i])))
+        return doubts
 
     def said_of(self, variances: Float[np.ndarray, "rows n"]) -> list[tuple[int, str]]:
-        """Return a row and a line for each angle whose deviation is above `_most` radians for the first time.
+        """Return a row and a line for each angle that is known too badly (variance over the usable) for the first time.
 
-        Beyond that the filter cannot take it for a Gaussian. `states`: names of the angles of which nothing was said
-        yet, by state; one that is said is taken out.
+        `states`: names of the angles of which nothing was said yet, by state; one that is said is taken out.
         """
-        said = []
+        doubts = []
         for i in list(self.states):
-            wide = np.flatnonzero(variances[:, i] > self._most**2)
-            if wide.size:
-                known = f"{self.states.pop(i)!r} is known to +- {variances[wide[0], i] ** 0.5:.2g} rad"
-                said.append((int(wide[0]), f"{known}; {REMEDY}"))
-        return said
+            rows_of_wide = np.flatnonzero(variances[:, i] > self._largest_usable**2)
+            if rows_of_wide.size:
+                finding = f"{self.states.pop(i)!r} is known to +- {variances[rows_of_wide[0], i] ** 0.5:.2g} rad"
+                doubts.append((int(rows_of_wide[0]), f"{finding}; {REMEDY}"))
+        return doubts
 
 
 def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
     """Yield (node, name, filter) of the filters that have angles."""
     if not first(network.plant).circular:
         return
-    for node, here in network.nodes.items():
-        yield from ((node, label, filter) for label, filter in here.filters.items() if filter.angles_used())
+    for node, network_node in network.nodes.items():
+        yield from ((node, label, filter) for label, filter in network_node.filters.items() if filter.angles_used())
     for label, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.angles_used():
             yield FUSED, label, fusion
@@ -178,9 +180,10 @@ def doubt_angles_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, 
     for name, angles in network.angles.items():
         names = network.nodes[name].received_names if angles else ()
         for i in angles:
-            far = np.abs(z[name][:, i]) > TURN
-            if np.any(far):
-                row = int(np.argmax(far))
-                said = f"{np.count_nonzero(far)} of {np.count_nonzero(~np.isnan(z[name][:, i]))} values are beyond 2 pi"
+            is_beyond = np.abs(z[name][:, i]) > TURN
+            if np.any(is_beyond):
+                row = int(np.argmax(is_beyond))
+                received = np.count_nonzero(~np.isnan(z[name][:, i]))
+                beyond = f"{np.count_nonzero(is_beyond)} of {received} values are beyond 2 pi"
                 value = f"row {row + 1}: {z[name][row, i]:.4g}"
-                yield f"node {name!r}: {names[i]!r} is an angle in radians, and {said}; {value}: degrees?"
+                yield f"node {name!r}: {names[i]!r} is an angle in radians, and {beyond}; {value}: degrees?"

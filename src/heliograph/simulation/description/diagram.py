@@ -120,9 +120,9 @@ def write_short_diagram(network: HasNodes) -> str:
 
 def _format_lines(network: HasNodes) -> list[str]:
     """Return the diagram's title, and a line for each part with its name in a column."""
-    parts = list_diagram_lines(network)
-    width = max(len(line.name) for line in parts)
-    return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in parts)]
+    lines = list_diagram_lines(network)
+    width = max(len(line.name) for line in lines)
+    return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in lines)]
 
 
 def _make_title(network: HasNodes) -> str:

@@ -84,13 +84,14 @@ def _find_unseen_states(
     `view`: how a filter sees plant and sensors; it depends on the estimate where these are not linear.
     """
     plant = view.plant
-    start = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
-    end, before = (means[-1], covariances[-1]), (means[-1 - LAST], covariances[-1 - LAST])
+    initial = np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+    last = means[-1], covariances[-1]
+    earlier = means[-1 - LAST], covariances[-1 - LAST]
     # Over one step first, which is cheap: hardly any recording ends so.
-    if not np.any(view.find_shown(*start, 1) & ~view.find_shown(*end, 1)):
+    if not np.any(view.find_shown(*initial, steps=1) & ~view.find_shown(*last, steps=1)):
         return np.zeros(len(plant.states), dtype=bool)
     steps = len(plant.states)
-    unseen = view.find_shown(*start, steps) & ~view.find_shown(*end, steps) & ~view.find_shown(*before, steps)
+    unseen = view.find_shown(*initial, steps) & ~view.find_shown(*last, steps) & ~view.find_shown(*earlier, steps)
     return np.asarray(unseen)
 
 
@@ -121,13 +122,13 @@ def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
 
 def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
     """Yield (node, name, filter, sensors that it hears) of every filter that claims a covariance."""
-    every = list_sensors(network)
+    all_sensors = list_sensors(network)
     for name, node in network.nodes.items():
-        sensors = [node.sensor] if isinstance(node, Node) else every  # others hear what several nodes send
-        yield from ((name, label, one, sensors) for label, one in node.filters.items() if one.claim != "none")
+        sensors = [node.sensor] if isinstance(node, Node) else all_sensors  # others hear what several nodes send
+        yield from ((name, label, filter, sensors) for label, filter in node.filters.items() if filter.claim != "none")
     for label, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.claim != "none":
-            yield FUSED, label, fusion, every
+            yield FUSED, label, fusion, all_sensors
 
 
 class _FilterView(NamedTuple):
@@ -155,8 +156,7 @@ class _FilterView(NamedTuple):
         by_tangent = np.any(make_observability_matrix(self.plant, self.sensors, mean, steps) != 0, axis=0)
         if self.tangent or np.all(by_tangent):
             return np.asarray(by_tangent)
-        spread = np.sqrt(len(mean) * np.maximum(np.diagonal(covariance), 0.0))
-        ahead, behind = (
-            simulate_outputs(self.plant, self.sensors, mean + sign * np.diag(spread), steps) for sign in (1.0, -1.0)
-        )
+        steps_of_points = np.sqrt(len(mean) * np.maximum(np.diagonal(covariance), 0.0))
+        ahead = simulate_outputs(self.plant, self.sensors, mean + np.diag(steps_of_points), steps)
+        behind = simulate_outputs(self.plant, self.sensors, mean - np.diag(steps_of_points), steps)
         return np.asarray(by_tangent | np.any(ahead != behind, axis=1))

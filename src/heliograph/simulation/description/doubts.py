@@ -27,9 +27,9 @@ from heliograph.simulation.covariance_claims import MistakenBelief, yield_mistak
 from heliograph.simulation.declared_noise.refit import list_links_declaring_noise
 from heliograph.simulation.description.angle_doubts import doubt_degrees_at_start, doubt_wide_angles_at_start
 from heliograph.simulation.description.diagram import list_rounded_numbers, list_shared_in_words
+from heliograph.simulation.description.execution_fallbacks import describe_sequential_filters, explain_xla_fallbacks
 from heliograph.simulation.description.observability import list_sensors, make_observability_matrix
 from heliograph.simulation.description.separable_nodes import separate_nodes
-from heliograph.simulation.description.slow_filters import describe_sequential_filters, explain_xla_fallbacks
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.results.overloaded_words import find_overloads
@@ -96,7 +96,8 @@ def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
     """
     for name, filters in find_overloads(network).items():
         for label, overload in filters.items():
-            yield Doubt(not float(overload.bound) <= SEEN, overload.describe(name, label))
+            is_serious = not float(overload.bound) <= SEEN  # NaN too
+            yield Doubt(serious=is_serious, words=overload.describe(name, label))
 
 
 def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
@@ -130,18 +131,19 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
     """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
     # All nodes together, then each that has filters.
-    yield from _doubt_error_bound(network, "the mean error of every filter", True)
-    alone = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
-    if len(network.nodes) == 1 or not alone:
+    yield from _doubt_error_bound(network, "the mean error of every filter", serious=True)
+    nodes_with_filters = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
+    if len(network.nodes) == 1 or not nodes_with_filters:
         return
-    if len(alone) > NODES_LIMIT:
-        yield Doubt(False, f"boundedness of each node alone: not judged of {len(alone)} nodes")
-        return
-    for name in alone:
-        node = network.nodes[name]
-        yield from _doubt_error_bound(
-            Network(network.plant, {name: node}), f"the mean error of {name!r} alone", not network.fused
+    if len(nodes_with_filters) > NODES_LIMIT:
+        yield Doubt(
+            serious=False, words=f"boundedness of each node alone: not judged of {len(nodes_with_filters)} nodes"
         )
+        return
+    for name in nodes_with_filters:
+        node = network.nodes[name]
+        network_of_node = Network(network.plant, {name: node})
+        yield from _doubt_error_bound(network_of_node, f"the mean error of {name!r} alone", serious=not network.fused)
 
 
 def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[Doubt]:
@@ -154,12 +156,12 @@ def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[D
         boundedness = certify_boundedness(network)
     except InputError as error:
         if serious:
-            yield Doubt(False, f"boundedness: not judged ({error})")
+            yield Doubt(serious=False, words=f"boundedness: not judged ({error})")
         return
     if boundedness.verdict == "impossible":
-        yield Doubt(serious, f"unbounded: {what} grows without end: {boundedness.reason}")
+        yield Doubt(serious=serious, words=f"unbounded: {what} grows without end: {boundedness.reason}")
     elif boundedness.verdict == "undecided":
-        yield Doubt(False, f"boundedness of {what}: undecided: {boundedness.reason}")
+        yield Doubt(serious=False, words=f"boundedness of {what}: undecided: {boundedness.reason}")
 
 
 def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
@@ -177,7 +179,7 @@ def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
         heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
         if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
             advice = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
-            yield Doubt(True, f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
+            yield Doubt(serious=True, words=f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
             continue
         silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
         if silent:
@@ -188,13 +190,17 @@ def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
     names = []
     for name, node in network.nodes.items():
-        told = [one for one in node.filters.values() if isinstance(one, ToldFilter)] if isinstance(node, Node) else []
-        if any(list_links_declaring_noise(one) for one in told):
+        told_filters = (
+            [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
+            if isinstance(node, Node)
+            else []
+        )
+        if any(list_links_declaring_noise(filter) for filter in told_filters):
             names.append(name)
     if names:
-        who = join_names([repr(name) for name in names])
+        senders = join_names([repr(name) for name in names])
         yield Doubt(
-            False, f"declared: noise is taken as the messages of {who} say it; `heliograph run --report` judges it"
+            False, f"declared: noise is taken as the messages of {senders} say it; `heliograph run --report` judges it"
         )
 
 
@@ -204,9 +210,9 @@ def _doubt_told_numbers_without_claim(network: Network) -> Iterator[Doubt]:
         if not isinstance(node, Node) or not node.filters:
             continue
         for affine in list_told_maps(first(node.channel)):
-            if why := affine.reason_for_no_claim:
-                what = join_names([repr(number) for number in affine.names])
-                yield Doubt(True, f"told: {what} at {name!r} {why}, so that claims are nominal")
+            if reason := affine.reason_for_no_claim:
+                numbers = join_names([repr(number) for number in affine.names])
+                yield Doubt(serious=True, words=f"told: {numbers} at {name!r} {reason}, so that claims are nominal")
 
 
 def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
@@ -214,25 +220,25 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
 
     `forgetful`: nodes, by filter, where it ignores the memory of their links. `lowered`: the claim was lowered for it.
     """
-    alike: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
+    beliefs_by_words: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
     forgetful = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in forgetful.get(belief.filter, ()):
             continue  # said already, with what to do
-        alike.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
-    for (lowered, _, _), beliefs in alike.items():
-        more = f" (and at {join_names([repr(belief.node) for belief in beliefs[1:]])})" if len(beliefs) > 1 else ""
+        beliefs_by_words.setdefault((belief.lowered, belief.filter, belief.parts), []).append(belief)
+    for (lowered, _, _), beliefs in beliefs_by_words.items():
+        other_nodes = join_names([repr(belief.node) for belief in beliefs[1:]])
+        places = f" (and at {other_nodes})" if len(beliefs) > 1 else ""
         consequence = ", so that its claim is nominal" if lowered else ""
-        yield Doubt(lowered, f"another world: {beliefs[0].words}{more}{consequence}")
+        yield Doubt(serious=lowered, words=f"another world: {beliefs[0].words}{places}{consequence}")
 
 
 def _doubt_forgetful_filters(network: Network) -> Iterator[Doubt]:
     """Yield a doubt for filters that take a link's draws as independent over time, though its gains have memory."""
     for label, names in _list_forgetful_nodes(network).items():
-        words = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
-        yield Doubt(
-            True, f"{words}, another channel than its own; linear_filter or mixture_filter of the link knows it"
-        )
+        finding = f"ignored memory: {label!r} of {join_names(names)} takes a link for one without memory"
+        remedy = "another channel than its own; linear_filter or mixture_filter of the link knows it"
+        yield Doubt(serious=True, words=f"{finding}, {remedy}")
 
 
 def _fix_told_numbers(channel: AbstractRandomAffine) -> AbstractRandomAffine:

@@ -15,7 +15,9 @@ Place = tuple[str, str]  # node and filter
 def find_remarking_filters(network: Network) -> tuple[Place, ...]:
     """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node"."""
     places = [(node, name) for node, name in network.places if network.nodes[node].filters[name].remarks]
-    fused = [(FUSED, name) for name, one in network.fused.items() if isinstance(one, AbstractFilter) and one.remarks]
+    fused = [
+        (FUSED, name) for name, filter in network.fused.items() if isinstance(filter, AbstractFilter) and filter.remarks
+    ]
     return *places, *fused
 
 
@@ -36,8 +38,8 @@ def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Rema
         place = network.places[node, name]
         # A stack has all nodes of its first filter, then all of its second, and so on.
         row = place.filter * len(network.groups[network.kinds[place.kind].group]) + place.node
-        of_filter = jax.tree.map(lambda leaf, r=row: leaf[r], alike[place.kind])
-        yield (node, name), network.nodes[node].filters[name].remark(of_filter)
+        filter_state = jax.tree.map(lambda leaf, row=row: leaf[row], alike[place.kind])
+        yield (node, name), network.nodes[node].filters[name].remark(filter_state)
 
 
 def describe_remarks(network: Network, state: PyTree) -> list[str]:

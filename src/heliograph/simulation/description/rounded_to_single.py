@@ -20,15 +20,16 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
 
     Rounded to single precision; of each model only the first such number is named.
     """
-    parts: dict[tuple[float, float], list[str]] = {}
-    seen: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
+    names_by_number: dict[tuple[float, float], list[str]] = {}
+    first_rounded: dict[int, tuple[float, float] | None] = {}  # of models, which nodes may share
     for name, model, functions in _yield_models_with_calls(network):
-        if id(model) not in seen:
-            seen[id(model)] = next(filter(None, map(find_rounded_to_single, _yield_arrays(model, functions))), None)
-        rounded = seen[id(model)]
+        if id(model) not in first_rounded:
+            found = map(find_rounded_to_single, _yield_arrays(model, functions))
+            first_rounded[id(model)] = next(filter(None, found), None)
+        rounded = first_rounded[id(model)]
         if rounded is not None:
-            parts.setdefault(rounded, []).append(name)
-    return parts
+            names_by_number.setdefault(rounded, []).append(name)
+    return names_by_number
 
 
 def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, list[Traced]]]:
@@ -61,6 +62,7 @@ def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> lis
     None of a function that cannot be traced by itself with these arguments.
     """
     try:
-        return [x for x in constants(function, *arguments)[0] if not is_traced(x)]
+        arrays, *_ = constants(function, *arguments)
+        return [array for array in arrays if not is_traced(array)]
     except (InputError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
         return []

@@ -45,4 +45,5 @@ def _mask_coupled(plant: object) -> Bool[np.ndarray, "states states"]:
     u = jnp.ones(len(plant.inputs))
     with jax.enable_x64(True):
         matrices = plant.transition_matrix(u), plant.noise_covariance(u), plant.initial_covariance
-    return np.asarray(sum(np.asarray(matrix) != 0 for matrix in matrices) > 0)
+    are_nonzero = [np.asarray(matrix) != 0 for matrix in matrices]
+    return np.asarray(sum(are_nonzero) > 0)

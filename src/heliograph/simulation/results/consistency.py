@@ -77,9 +77,10 @@ def nees(
     """
     axes = max(rank("truth", truth), 1)
     x = array("truth", truth, (None,) * axes, missing=True)
-    m = array("mean", mean, x.shape, missing=True)
-    errors = read_manifold(angles, x.shape[-1]).difference(x, m)
-    return _compute_normalised_square(errors, _broadcast_covariance_to_steps(covariance, x), size=x)
+    estimates = array("mean", mean, x.shape, missing=True)
+    errors = read_manifold(angles, x.shape[-1]).difference(x, estimates)
+    covariances = _broadcast_covariance_to_steps(covariance, x)
+    return _compute_normalised_square(errors, covariances, size=x)
 
 
 def nis(
@@ -132,11 +133,12 @@ def _compute_normalised_square(
     # A missing component counts as zero, of variance 1, correlated with nothing: it adds 0^2 / 1.
     present, n = ~np.isnan(x), x.shape[-1]
     both_present = present[..., :, None] & present[..., None, :]
-    filled = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
+    with_missing = np.where(both_present, covariance, np.eye(n) * ~present[..., None, :])
     errors, sizes = np.where(present, x, 0.0), np.nan_to_num(size)
     # One matrix after another, whatever the leading axes are.
-    squares = _square_distances(filled.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
-    return np.asarray(np.where(present.any(axis=-1), np.asarray(squares).reshape(x.shape[:-1]), np.nan))
+    squares = _square_distances(with_missing.reshape(-1, n, n), errors.reshape(-1, n), sizes.reshape(-1, n))
+    squares_by_step = np.asarray(squares).reshape(x.shape[:-1])
+    return np.asarray(np.where(present.any(axis=-1), squares_by_step, np.nan))
 
 
 @compile_on_call
@@ -172,7 +174,7 @@ def consistency(
     """
     entries = array("values", values, (None,) * (2 if rank("values", values) == 2 else 1), missing=True)
     rows = np.atleast_2d(entries)  # (runs, steps)
-    level = float(scalar("confidence", confidence, 0.0, 1.0))
+    level = float(scalar("confidence", confidence, low=0.0, high=1.0))
     if not 0 < level < 1:
         raise fail("confidence", "a number between 0 and 1", confidence)
     present = ~np.isnan(rows)
@@ -222,11 +224,11 @@ def _bound_mean(degrees: float, count: int, quantiles: Float[np.ndarray, "2"]) -
     return np.asarray(2 * scipy.special.gammaincinv(degrees / 2, quantiles) / count) if count else np.full(2, np.nan)
 
 
-def _correlate_over_steps(apart: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
+def _correlate_over_steps(deviations: Float[np.ndarray, "runs steps"], lags: int) -> Float[np.ndarray, " lags"]:
     """Return the correlation over 1, 2, ..., `lags` steps of values given by their deviations from the mean.
 
-    `apart`: the deviations, 0 of missing values, which then add nothing.
+    `deviations`: the deviations, 0 of missing values, which then add nothing.
     """
-    power = np.sum(apart**2)
-    sums = [np.sum(apart[:, :-t] * apart[:, t:]) for t in range(1, lags + 1)]
-    return np.asarray([s / power if power > 0 else 0.0 for s in sums])
+    power = np.sum(deviations**2)
+    products = [np.sum(deviations[:, :-t] * deviations[:, t:]) for t in range(1, lags + 1)]
+    return np.asarray([product / power if power > 0 else 0.0 for product in products])

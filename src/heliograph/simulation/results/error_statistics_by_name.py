@@ -59,6 +59,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         states: tuple[str, ...],
         units: Mapping[str, str] | None = None,
     ):
+        """Make the dictionary from statistics by node and filter, with the names of the states and their units."""
         super().__init__(by_node)
         # Units that the states' names carry, and those given, which prevail.
         self.states, self.units = states, units_in(states) | dict(units or {})

@@ -167,11 +167,14 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
         `claims`: of the smoothed estimates' covariances, by node and filter.
         """
-        results = {
-            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
+        statistics = {
+            node: {
+                name: replace(statistics_of_filter, claim=claims[node][name])
+                for name, statistics_of_filter in filters.items()
+            }
             for node, filters in smoothed.items()
         }
-        filtered.smoothed = StatisticsByName(results, smoothed.states)
+        filtered.smoothed = StatisticsByName(statistics, smoothed.states)
         return filtered
 
 
@@ -192,7 +195,7 @@ class _FilterSums(NamedTuple):
 
 def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> ErrorStatistics:
     """Return the statistics of one filter from its sums over runs; `count`: runs in each batch."""
-    # Failures are counted by test, of means first: those alone are tested where no covariance is claimed.
+    # Failures are counted by test, that of means first: the only one where no covariance is claimed.
     tests = 0 if claim == "none" else slice(None)
     return ErrorStatistics(
         count=count,
@@ -276,7 +279,7 @@ def _reduce_run(truth: Array, mean: Array, covariance: Array, attitude: tuple[in
 
     The filter is given as a fused one without a name, since a step of a simulation has estimates by name.
     """
-    estimate = Estimate(mean, covariance, "none", attitude=attitude)
+    estimate = Estimate(mean, covariance, claim="none", attitude=attitude)
     steps = {"truth": truth, "estimates": (), "fused": {"": estimate}, "uplinks": {}}
     return reduce_rows(Statistics(), steps)
 

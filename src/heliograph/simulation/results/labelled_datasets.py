@@ -37,8 +37,8 @@ def drop_unused_modes(modes: np.ndarray | None) -> np.ndarray | None:
     """
     if modes is None:
         return None
-    used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
-    return modes[..., used] if used.any() else None
+    is_used = ~np.isnan(modes).all(axis=tuple(range(modes.ndim - 1)))
+    return modes[..., is_used] if is_used.any() else None
 
 
 TIME = "time"
@@ -142,10 +142,13 @@ class FilterLabels:
     def list_placed(self, read: Callable[[Any], T]) -> list[Placed[T]]:
         """Return what `read` gives of each result, with the result's place (number of node, number of filter)."""
         filters = self.filters
-        return [((self.nodes.index(node), filters.index(name)), read(result))
-                for node, by_filter in self.by_node.items() for name, result in by_filter.items()]  # fmt: skip
+        placed: list[Placed[T]] = []
+        for node, by_filter in self.by_node.items():
+            for name, result in by_filter.items():
+                placed.append(((self.nodes.index(node), filters.index(name)), read(result)))
+        return placed
 
-    def fill_field(self, name: str, parts: Iterable[Placed[ArrayLike]]) -> np.ndarray:
+    def fill_field(self, name: str, placed_values: Iterable[Placed[ArrayLike]]) -> np.ndarray:
         """Return the array of a field with these parts at their places along node, or node and filter; NaN elsewhere.
 
         A part that is shorter than its axis, as measurements of a node may be, fills the beginning. `rows`, `lengths`:
@@ -155,11 +158,12 @@ class FilterLabels:
         sizes |= {"other": len(self.states), **self.rows, **self.lengths}
         axes = list_axes(name, list(self.rows))
         array, node_axis = np.full([sizes[axis] for axis in axes], np.nan), axes.index("node")
-        for place, part in parts:
+        for place, values in placed_values:
             # Rows before the node's axis, the part's own axes behind its place.
-            lengths = np.shape(part)[node_axis:]
-            index: Any = (*(slice(None),) * node_axis, *place, *map(slice, lengths))
-            array[index] = part
+            lengths = np.shape(values)[node_axis:]
+            all_rows = (slice(None),) * node_axis
+            index: Any = (*all_rows, *place, *map(slice, lengths))
+            array[index] = values
         return array
 
     def fill_from_results(self, name: str, read: Callable[[Any], ArrayLike]) -> np.ndarray:
@@ -181,10 +185,11 @@ class FilterLabels:
 
         By state its place among all their numbers, -1 of other states.
         """
-        places = next((places for _, places in self.list_placed(lambda result: result.attitude) if places), ())
+        placed = self.list_placed(lambda result: result.attitude)
+        rotations = next((states for _, states in placed if states), ())  # the same of all filters that have some
         order = np.full(len(self.states), -1, dtype=np.int64)
-        order[list(places)] = np.arange(len(places))
-        return {"attitude": order} if places else {}
+        order[list(rotations)] = np.arange(len(rotations))
+        return {"attitude": order} if rotations else {}
 
     def make_quantizer_fields(self) -> dict[str, np.ndarray]:
         """Return the fields of what the quantizers sent, by fusion and sender; none without quantizers.
@@ -261,8 +266,10 @@ def iterate_filters(
     fields = {name: read_values(dataset, name, lead) for name in names}
     node_axes = {name: list_axes(name, lead).index("node") for name in names}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):  # "": node i has no filter j
-        # All rows, whose axes stand before that of nodes, of node i and filter j.
-        values = {name: field[(*(slice(None),) * node_axes[name], i, j)].copy() for name, field in fields.items()}
+        values = {}
+        for name, field in fields.items():
+            all_rows = (slice(None),) * node_axes[name]  # the axes of rows stand before that of nodes
+            values[name] = field[(*all_rows, i, j)].copy()
         yield nodes[i], filters[j], cast(Claim, str(claim[i, j])), values
 
 
@@ -302,9 +309,9 @@ def make_name_array(names: Sequence[str]) -> np.ndarray:
 
 def check_title(dataset: "xr.Dataset", title: str) -> None:
     """Raise ValueError unless the dataset has this title."""
-    came = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
-    if came != title:
-        raise fail("dataset", f"one whose title is {title!r}", repr(came))
+    title_found = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
+    if title_found != title:
+        raise fail("dataset", f"one whose title is {title!r}", repr(title_found))
 
 
 def read_labels(dataset: "xr.Dataset", axis: str) -> list[str]:
@@ -321,8 +328,8 @@ def read_values(dataset: "xr.Dataset", name: str, lead: Sequence[str]) -> np.nda
     """
     axes = list_axes(name, lead)
     if name not in dataset or set(dataset[name].dims) != set(axes):
-        came = list(dataset[name].dims) if name in dataset else "no such variable"
-        raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", came)
+        found = list(dataset[name].dims) if name in dataset else "no such variable"
+        raise fail(f"dataset, variable {name!r}", f"the dimensions {axes}", found)
     return np.asarray(dataset[name].transpose(*axes).values)
 
 

@@ -17,11 +17,11 @@ def find_overloads(network: object) -> Overloads:
     """
     if not isinstance(network, Network):
         return {}
-    found: Overloads = {}
+    overloads: Overloads = {}
     for name, node in network.nodes.items():
         by_filter = {
             label: filter.overload for label, filter in node.filters.items() if isinstance(filter, LinearWordsFilter)
         }
         if by_filter:
-            found[name] = by_filter
-    return found
+            overloads[name] = by_filter
+    return overloads

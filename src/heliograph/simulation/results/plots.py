@@ -18,25 +18,25 @@ if TYPE_CHECKING:  # an extra
 
 
 def choose_filters(
-    known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
+    filters_by_node: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
     """Return the node to draw, by default the first with filters, and its filters, by default all; raise at others."""
-    with_filters = [name for name, by_filter in known.items() if by_filter]
+    with_filters = [name for name, by_filter in filters_by_node.items() if by_filter]
     if not with_filters or node not in (None, *with_filters):
         raise fail("node", f"one with filters: {', '.join(with_filters) or 'there is none'}", repr(node))
-    chosen = with_filters[0] if node is None else node
-    names = list(known[chosen]) if filters is None else list(filters)
-    unknown = [name for name in names if name not in known[chosen]]
+    chosen_node = with_filters[0] if node is None else node
+    names = list(filters_by_node[chosen_node]) if filters is None else list(filters)
+    unknown = [name for name in names if name not in filters_by_node[chosen_node]]
     if unknown or not names:
-        raise fail(
-            f"filters of {chosen}", f"some of {', '.join(known[chosen])}", repr(unknown[0]) if unknown else "none"
-        )
-    return chosen, names
+        expected = f"some of {', '.join(filters_by_node[chosen_node])}"
+        raise fail(f"filters of {chosen_node}", expected, repr(unknown[0]) if unknown else "none")
+    return chosen_node, names
 
 
 def find_state_places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
     """Return the places of the named states among the `known` ones, all by default; raise ValueError at others."""
-    chosen = list(known) if states is None else [states] if isinstance(states, str) else list(states)
+    one_or_all = [states] if isinstance(states, str) else states
+    chosen = list(known if one_or_all is None else one_or_all)
     for name in chosen:
         if name not in known:
             raise fail("states", f"some of {', '.join(known)}", repr(name))
@@ -51,20 +51,19 @@ def make_panels(axes: object, count: int, time: np.ndarray, units: Mapping[str, 
     if axes is None:
         import matplotlib.pyplot as plt
 
-        _, grid = plt.subplots(
-            count, 1, squeeze=False, sharex=True, layout="constrained", figsize=(6.4, 1 + 1.8 * count)
-        )
+        size = 6.4, 1 + 1.8 * count  # inches
+        _, grid = plt.subplots(count, 1, squeeze=False, sharex=True, layout="constrained", figsize=size)
         grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else label_with_unit("time", units))
         return list(grid[:, 0])
-    given = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(given) != count:
-        raise fail("axes", f"{count}, one for each state", len(given))
-    return given
+    panels = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(panels) != count:
+        raise fail("axes", f"{count}, one for each state", len(panels))
+    return panels
 
 
 def check_run(run: int, runs: int | None) -> None:
     """Raise ValueError unless there is such a run; of a recording, which has none, any number will do."""
-    if runs is not None and check_count("run", run, 0) >= runs:
+    if runs is not None and check_count("run", run, least=0) >= runs:
         raise fail("run", f"one of {runs}, counted from 0", run)
 
 
@@ -77,12 +76,15 @@ def draw_state(
     """
     run, i = run_and_state
     for number, (name, estimate) in enumerate(estimates.items()):
-        mean, variance = np.asarray(estimate.mean)[run][..., i], np.asarray(estimate.covariance)[run][..., i, i]
+        mean = np.asarray(estimate.mean)[run][..., i]
+        variance = np.asarray(estimate.covariance)[run][..., i, i]
         deviation = np.sqrt(np.where(variance >= 0, variance, np.nan))
-        shown, mean, band = insert_gaps_at_wraps(time, mean, sigmas * deviation)
-        panel.plot(shown, mean, color=choose_colour(number), label=quote_for_figure(name))
+        drawn_time, mean, band = insert_gaps_at_wraps(time, mean, sigmas * deviation)
+        panel.plot(drawn_time, mean, color=choose_colour(number), label=quote_for_figure(name))
         if estimate.claim != "none":
-            panel.fill_between(shown, mean - band, mean + band, color=choose_colour(number), alpha=0.2, linewidth=0)
+            panel.fill_between(
+                drawn_time, mean - band, mean + band, color=choose_colour(number), alpha=0.2, linewidth=0
+            )
 
 
 def draw_truth(panel: "Axes", time: ArrayLike, truth: ArrayLike) -> None:
@@ -156,4 +158,5 @@ def insert_gaps_at_wraps(time: ArrayLike, mean: ArrayLike, *others: np.ndarray) 
     jumps = np.flatnonzero(np.abs(np.diff(mean)) > np.pi) + 1
     if not jumps.size or np.nanmax(np.abs(mean)) > np.pi + 1e-9:
         return time, mean, *others
-    return np.insert(time, jumps, time[jumps]), *(np.insert(part, jumps, np.nan) for part in (mean, *others))
+    time_with_gaps = np.insert(time, jumps, time[jumps])
+    return time_with_gaps, *(np.insert(values, jumps, np.nan) for values in (mean, *others))

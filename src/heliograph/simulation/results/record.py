@@ -114,7 +114,7 @@ class Record(SavableResults):
     def with_origin(self, origin: Origin) -> "Record":
         """Return the same record with the states in which its filters ended, from which more rows can be filtered."""
         changed = copy(self)
-        vars(changed)["origin"] = origin
+        vars(changed)["origin"] = origin  # fields are frozen
         return changed
 
     @property
@@ -125,9 +125,9 @@ class Record(SavableResults):
     @property
     def runs(self) -> int | None:
         """Number of Monte Carlo runs, the first of three axes of all arrays; None for one recording, of two axes."""
-        means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
-        every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
-        return len(every[0]) if every and every[0].ndim == 3 else None
+        means = [np.asarray(estimate.mean) for filters in self.estimates.values() for estimate in filters.values()]
+        arrays = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
+        return len(arrays[0]) if arrays and arrays[0].ndim == 3 else None
 
     def of_run(self, run: int) -> "Record":
         """Return the record of one of the runs, without an axis of runs.
@@ -135,7 +135,7 @@ class Record(SavableResults):
         Raises:
             ValueError: a recording, which has none, or a number that no run has.
         """
-        if self.runs is None or check_count("run", run, 0) >= self.runs:
+        if self.runs is None or check_count("run", run, least=0) >= self.runs:
             raise fail("run", "one of a Monte Carlo simulation" if self.runs is None else f"one of {self.runs}", run)
         measurements, estimates, reports = jax.tree.map(
             lambda leaf: np.asarray(leaf)[run], (self.measurements, self.estimates, self.reports)
@@ -165,8 +165,8 @@ class Record(SavableResults):
     def check_filter(self, node: str, name: str) -> None:
         """Raise ValueError unless the node has a filter of this name."""
         if name not in self.estimates.get(node, {}):
-            known = [f"{element}/{label}" for element, filters in self.estimates.items() for label in filters]
-            raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
+            available = [f"{node_name}/{label}" for node_name, filters in self.estimates.items() for label in filters]
+            raise fail("node and filter", f"one of {', '.join(available)}", f"{node}/{name}")
 
     def rmse(self, node: str, name: str) -> dict[str, float]:
         """Return the root mean square error of each state, in its unit, over runs and the steps whose truth is known.
@@ -175,8 +175,8 @@ class Record(SavableResults):
             ValueError: a recording has no truth, or there is no such filter.
         """
         squares = self.errors(node, name).reshape(-1, len(self.states)) ** 2
-        known = ~np.isnan(np.asarray(self.truth)).reshape(squares.shape)
-        sums, count = np.sum(np.where(known, squares, 0.0), axis=0), known.sum(axis=0)
+        is_known = ~np.isnan(np.asarray(self.truth)).reshape(squares.shape)
+        sums, count = np.sum(np.where(is_known, squares, 0.0), axis=0), is_known.sum(axis=0)
         mean = np.divide(sums, count, out=np.full(len(count), np.nan), where=count > 0)
         return dict(zip(self.states, np.sqrt(mean).tolist(), strict=True))
 
@@ -190,11 +190,11 @@ class Record(SavableResults):
             ValueError: a recording has no truth, or there is no such filter.
         """
         errors, estimate, truth = self.errors(node, name), self.estimates[node][name], np.asarray(self.truth)
-        sound = mask_sound_estimates(estimate)[..., None]
+        is_sound = mask_sound_estimates(estimate)[..., None]
         if estimate.claim == "none":
             return np.full(errors.shape[:-1], np.nan)
-        claimed = np.where(sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
-        return nees(truth, np.where(sound, truth - errors, np.nan), claimed)
+        covariance = np.where(is_sound[..., None], np.asarray(estimate.covariance), np.eye(len(self.states)))
+        return nees(truth, np.where(is_sound, truth - errors, np.nan), covariance)
 
     def outputs(self, node: str, name: str) -> tuple[InnovationSummary, ...]:
         """Return a summary of innovations for each output of a filter that weighs: what it used, weights, bias, size.
@@ -204,7 +204,7 @@ class Record(SavableResults):
         """
         self.check_filter(node, name)
         if name not in self.weighed.get(node, {}):
-            weighing = [f"{element}/{label}" for element, filters in self.weighed.items() for label in filters]
+            weighing = [f"{node_name}/{label}" for node_name, filters in self.weighed.items() for label in filters]
             raise fail("node and filter", f"one that weighs, of a recording: {weighing}", f"{node}/{name}")
         return self.weighed[node][name].summarise()
 
@@ -360,8 +360,8 @@ class Record(SavableResults):
             ModuleNotFoundError: without matplotlib (extra "report").
         """
         check_run(run, self.runs)
-        return draw_modes(self.estimates, node, filters, axes, None if self.runs is None else run,
-                          (self.time, self.units))  # fmt: skip
+        run_index = None if self.runs is None else run
+        return draw_modes(self.estimates, node, filters, axes, run_index, (self.time, self.units))
 
     def failures(self) -> list[str]:
         """List filters whose estimate became non-finite or whose bound lost positive semidefiniteness, a line each.
@@ -388,13 +388,13 @@ class Record(SavableResults):
         return lines
 
 
-def describe_bad_steps(bad: np.ndarray) -> list[str]:
-    """Return a list of one phrase: from which step on, and in how many runs, the flags `bad` (..., time) hold.
+def describe_bad_steps(is_bad: np.ndarray) -> list[str]:
+    """Return a list of one phrase: from which step on, and in how many runs, the flags `is_bad` (..., time) hold.
 
     An empty list where they never do.
     """
-    if not np.any(bad):
+    if not np.any(is_bad):
         return []
-    by_time = bad.reshape(-1, bad.shape[-1])
+    by_time = is_bad.reshape(-1, is_bad.shape[-1])
     step, runs = int(np.argmax(by_time.any(axis=0))), int(by_time.any(axis=1).sum())
     return [f"from step {step} in {runs} of {len(by_time)} runs"]

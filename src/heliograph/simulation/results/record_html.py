@@ -89,12 +89,12 @@ def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str
         for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)
     ]
     entries += [("border-top:2px dashed;height:0", "truth")] if record.truth is not None else []
-    marks = [
+    spans = [
         f'<span style="margin-right:12px"><span style="display:inline-block;width:14px;height:8px;{style};'
-        f'margin-right:4px"></span>{escape(visible(said))}</span>'
-        for style, said in entries
+        f'margin-right:4px"></span>{escape(visible(words))}</span>'
+        for style, words in entries
     ]
-    return f"<div>{''.join(marks)}</div>"
+    return f"<div>{''.join(spans)}</div>"
 
 
 def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state: int, chosen: np.ndarray) -> str:
@@ -138,28 +138,28 @@ def _write_panel(record: DrawableRecord, filters: Mapping[str, Estimate], state:
     )
 
 
-def _read_curve(estimate: Estimate, state: int, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read_curve(estimate: Estimate, state: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean, lower and upper end of the band of a state in the chosen rows; the ends are NaN without a claim.
 
     The band is SIGMAS (2) claimed deviations to either side.
     """
-    mean = np.asarray(estimate.mean)[chosen, state]
-    variance = np.asarray(estimate.covariance)[chosen, state, state]
-    claimed = (variance >= 0) & (estimate.claim != "none")
-    half = SIGMAS * np.sqrt(np.where(claimed, variance, np.nan))
-    return mean, mean - half, mean + half
+    mean = np.asarray(estimate.mean)[rows, state]
+    variance = np.asarray(estimate.covariance)[rows, state, state]
+    has_claim = (variance >= 0) & (estimate.claim != "none")
+    half_width = SIGMAS * np.sqrt(np.where(has_claim, variance, np.nan))
+    return mean, mean - half_width, mean + half_width
 
 
-def _find_range(parts: Sequence[np.ndarray]) -> tuple[float, float]:
+def _find_range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     """Return the range of all finite values, a little wider, and never empty."""
-    values = np.concatenate(parts)
+    values = np.concatenate(arrays)
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
-    # 4 % on either side; LEAST of the size, 1e-12, where all values are equal.
-    room = max(0.04 * (high - low), LEAST * max(abs(low), abs(high), 1.0))
-    return low - room, high + room
+    # 4 % on either side; 1e-12 (LEAST) of the size where all values are equal.
+    margin = max(0.04 * (high - low), LEAST * max(abs(low), abs(high), 1.0))
+    return low - margin, high + margin
 
 
 def _compute_x_places(count: int) -> np.ndarray:
@@ -179,9 +179,10 @@ def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
     SVG: M moves the pen, L draws a line to a point.
     """
     x = _compute_x_places(len(y))
-    d = "".join("M" + "L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y)))
+    pieces = ["L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y))]
+    path = "".join(f"M{points}" for points in pieces)
     return (
-        f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
+        f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
         f' stroke-linecap="round"{attributes}/>'
     )
 
@@ -193,5 +194,6 @@ def _yield_band_paths(lower: np.ndarray, upper: np.ndarray) -> Iterator[str]:
     """
     x = _compute_x_places(len(lower))
     for piece in _split_at_gaps(np.isfinite(lower) & np.isfinite(upper)):
-        ends = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece] + [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
-        yield f"M{'L'.join(ends)}Z"
+        along_upper = [f"{x[k]:.1f} {upper[k]:.2f}" for k in piece]
+        back_along_lower = [f"{x[k]:.1f} {lower[k]:.2f}" for k in piece[::-1]]
+        yield f"M{'L'.join(along_upper + back_along_lower)}Z"

@@ -141,7 +141,7 @@ class Trajectories(AbstractReducer[Record]):
         Its time is that of the last steps if there are fewer.
         """
         estimates = {
-            node: {name: replace(score, claim=claims[node][name]) for name, score in filters.items()}
+            node: {name: replace(estimate, claim=claims[node][name]) for name, estimate in filters.items()}
             for node, filters in smoothed.estimates.items()
         }
         time = filtered.time[-len(smoothed.time) :]

@@ -41,13 +41,13 @@ def list_refusals(
         refused: by node the number of each reading's reason, 0 where it is kept (time, received).
         weighed: by node and filter the weights of its components, NaN where nothing arrived (time, received).
     """
-    counted = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
+    refusals = [refusal for node, reasons in refused.items() for refusal in _count_refusals(node, "", reasons)]
     for node, filters in weighed.items():
-        for filter, parts in filters.items():
+        for filter, weighed_innovations in filters.items():
             # A weight of 0: the filter left the reading out, for the reason "gate".
-            gate = np.where(np.asarray(parts.weight) == 0, number_of_reason("gate"), 0)
-            counted += _count_refusals(node, filter, gate)
-    return tuple(counted)
+            is_left_out = np.asarray(weighed_innovations.weight) == 0
+            refusals += _count_refusals(node, filter, np.where(is_left_out, number_of_reason("gate"), 0))
+    return tuple(refusals)
 
 
 def _count_refusals(node: str, filter: str, refused: np.ndarray) -> Iterator[Refusal]:

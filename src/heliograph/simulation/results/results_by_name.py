@@ -44,9 +44,10 @@ def _name_arrivals(network: Network, name: str, arrived: np.ndarray) -> dict[str
     reports = {}
     for i, node in enumerate(network.mesh_nodes(name)):
         if count := len(neighbours[node]):
-            flags = arrived[..., i, :, 1 : count + 1]  # without the node's own message, and without padding
-            ages = np.where(flags >= 0, flags, np.nan) if flags.dtype != bool else np.where(flags, 1.0, np.nan)
-            values = ages.reshape(*flags.shape[:-2], -1)
+            arrivals = arrived[..., i, :, 1 : count + 1]  # without the node's own message, and without padding
+            are_flags = arrivals.dtype == bool
+            ages = np.where(arrivals, 1.0, np.nan) if are_flags else np.where(arrivals >= 0, arrivals, np.nan)
+            values = ages.reshape(*arrivals.shape[:-2], -1)
             # Messages that are late say so by their ages: the delays beside them are zeros.
             reports[node] = SentReports(values, np.zeros(values.shape[:-1], dtype=int))
     return reports
@@ -83,12 +84,15 @@ def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[st
 
     `batch`: estimates of many steps, stacked by kind of filter, and fused ones by name; FUSED is the centre's "node".
     """
-    parts, fused = batch["estimates"], batch["fused"] if network.fused else {}
-    modes = {(FUSED, name): np.asarray(one.modes) for name, one in fused.items() if one.modes is not None}
+    estimates_by_kind = batch["estimates"]
+    fused = batch["fused"] if network.fused else {}
+    modes = {
+        (FUSED, name): np.asarray(estimate.modes) for name, estimate in fused.items() if estimate.modes is not None
+    }
     for name, place in network.places.items():
         # Of nodes' filters (..., filter, node, M), where the batch has estimates of their kind.
-        if place.kind < len(parts) and parts[place.kind].modes is not None:
-            modes[name] = np.asarray(parts[place.kind].modes)[..., place.filter, place.node, :]
+        if place.kind < len(estimates_by_kind) and estimates_by_kind[place.kind].modes is not None:
+            modes[name] = np.asarray(estimates_by_kind[place.kind].modes)[..., place.filter, place.node, :]
     return modes
 
 
@@ -97,11 +101,11 @@ def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, d
 
     `batch`: "weighed" has them by kind of filter, (time, filter, node, m), None of kinds that do not weigh.
     """
-    parts = batch.get("weighed", ())
+    weighed_by_kind = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
-    for (node, name), place in network.places.items() if parts else ():
-        if parts[place.kind] is not None:
-            fields = [np.asarray(field)[:, place.filter, place.node] for field in parts[place.kind]]
+    for (node, name), place in network.places.items() if weighed_by_kind else ():
+        if weighed_by_kind[place.kind] is not None:
+            fields = [np.asarray(field)[:, place.filter, place.node] for field in weighed_by_kind[place.kind]]
             weighed.setdefault(node, {})[name] = Weighed(*fields)
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
     return weighed | ({FUSED: central} if central else {})

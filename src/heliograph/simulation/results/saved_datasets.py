@@ -36,7 +36,7 @@ class SavableResults:
         """
         smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
         changed = copy(self)
-        vars(changed).update(units=select_given_units(units, self.states), smoothed=smoothed)
+        vars(changed).update(units=select_given_units(units, self.states), smoothed=smoothed)  # fields are frozen
         return changed
 
     def to_xarray(self) -> "xr.Dataset":
@@ -140,10 +140,10 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
 
 def _find_package(path: Path) -> str:
     """Return the name of the package for files with this ending; raise ValueError at another ending."""
-    kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
-    if path.suffix.lower() not in kinds:
-        raise fail(str(path), f"a name that ends in {' or '.join(kinds)}", repr(path.suffix))
-    return kinds[path.suffix.lower()]
+    packages = {NETCDF: "h5netcdf", ZARR: "zarr"}
+    if path.suffix.lower() not in packages:
+        raise fail(str(path), f"a name that ends in {' or '.join(packages)}", repr(path.suffix))
+    return packages[path.suffix.lower()]
 
 
 def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
@@ -153,9 +153,9 @@ def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
     """Return names changed each by `change`: for files as texts of fixed length, else as Python's texts."""
-    changed = [change(str(name)) for name in names.values]
+    changed_names = [change(str(name)) for name in names.values]
     if change is quote_for_file:
-        return np.array(changed, dtype="U")
-    texts = np.empty(len(changed), dtype=object)  # a fixed length would drop final zero characters
-    texts[:] = changed
+        return np.array(changed_names, dtype="U")
+    texts = np.empty(len(changed_names), dtype=object)  # a fixed length would drop final zero characters
+    texts[:] = changed_names
     return texts

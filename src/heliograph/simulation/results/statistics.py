@@ -49,9 +49,9 @@ class ErrorStatistics:
         """In words, from which step on and in how many runs estimates were not valid; empty where all were."""
         if not self.failed_runs:
             return ""
-        what = "mean" if self.claim == "none" else "covariance"
+        moment = "mean" if self.claim == "none" else "covariance"
         step = 0 if self.failed is None else int(np.argmax(self.failed > 0))
-        return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
+        return f"no valid {moment} from step {step} in {self.failed_runs} of {self.runs} runs"
 
     def _warn_of_failures(self) -> None:
         """Warn, at the caller of a public method, that figures are NaN since some run had no valid estimate."""
@@ -104,8 +104,8 @@ class ErrorStatistics:
         self._warn_of_failures()
         # `outer`: e e' summed over the runs of each batch, (batch, time, n, n).
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
-        results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
-        return np.array([root for root, _ in results]), np.array([error for _, error in results])
+        roots_and_errors = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
+        return np.array([root for root, _ in roots_and_errors]), np.array([error for _, error in roots_and_errors])
 
     def deviation_by_state(self) -> np.ndarray:
         """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
@@ -146,13 +146,13 @@ class ErrorStatistics:
         if self.runs < 4:
             raise fail("worst direction", "at least 4 runs", self.runs)
         outer, covariance = self.outer, self.covariance
-        broken = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))  # by step
+        is_invalid = ~(np.isfinite(outer) & np.isfinite(covariance)).all(axis=(0, 2, 3))  # by step
         self._warn_of_failures()
-        if np.any(broken):
+        if np.any(is_invalid):
             undefined = np.full(outer.shape[-1], np.nan)
-            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), undefined)
-        halves = [self._estimate_worst_ratio(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
-        return max(halves, key=lambda found: found.ratio)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(is_invalid)), undefined)
+        estimates = [self._estimate_worst_ratio(np.arange(BATCHES) % 2 == side, outer, covariance) for side in (0, 1)]
+        return max(estimates, key=lambda estimate: estimate.ratio)
 
     def _estimate_worst_ratio(
         self, held_out: np.ndarray, outer: np.ndarray, covariance: np.ndarray
@@ -253,8 +253,8 @@ def _average_batches(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]
 
     `count`: number of runs in each batch.
     """
-    used = count > 0
-    sums, count = sums[used], count[used]
+    has_runs = count > 0
+    sums, count = sums[has_runs], count[has_runs]
     mean = float(sums.sum() / count.sum())
     groups = len(count)
     if groups < 2:
@@ -280,8 +280,8 @@ def _solve_generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, 
     Each component is in units of its root of B_ii, and where that is zero of its root of A_ii. With W' B W = I the
     eigenvalues are those of W' A W; the vectors d = W times its eigenvectors.
     """
-    of_b, of_a = (np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a))
-    unit = np.where(of_b > 0, of_b, np.where(of_a > 0, of_a, 1.0))
+    root_b, root_a = (np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 0.0)) for matrix in (b, a))
+    unit = np.where(root_b > 0, root_b, np.where(root_a > 0, root_a, 1.0))
     scale = unit[..., :, None] * unit[..., None, :]
     eigenvalues, vectors = np.linalg.eigh(b / scale)
     # W: B's eigenvectors over the roots of its eigenvalues, those of zero taken as rounding.

@@ -125,8 +125,8 @@ def memory_test(
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
-    white = _scale_to_unit_power(data) if filter is None else whitened_innovations(data, filter, inputs)
-    return MemoryTest.of(white, lags, claimed=filter is not None)
+    whitened = _scale_to_unit_power(data) if filter is None else whitened_innovations(data, filter, inputs)
+    return MemoryTest.of(whitened, lags, claimed=filter is not None)
 
 
 def _scale_to_unit_power(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
@@ -135,7 +135,8 @@ def _scale_to_unit_power(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     value = values[:, None] if values.ndim == 1 else values
     largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
     value = value / np.where(largest > 0, largest, 1.0)
-    deviation = np.sqrt(np.nansum(value**2, axis=0) / np.maximum(np.sum(~np.isnan(value), axis=0), 1))
+    count = np.maximum(np.sum(~np.isnan(value), axis=0), 1)
+    deviation = np.sqrt(np.nansum(value**2, axis=0) / count)
     return np.asarray(value / np.where(deviation > 0, deviation, 1.0))
 
 
@@ -157,7 +158,8 @@ def whitened_innovations(
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
     """
-    return np.asarray(score_innovations(filter, data, inputs)[1])
+    _, whitened = score_innovations(filter, data, inputs)
+    return np.asarray(whitened)
 
 
 def _average_components(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -187,8 +189,9 @@ def score_innovations(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     if filter.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
-    likelihoods, white = compute_once(_whiten_innovations, _by_xla, (filter, *check_data(filter, data, inputs)))
-    return likelihoods, white
+    arguments = filter, *check_data(filter, data, inputs)
+    likelihoods, whitened = compute_once(_whiten_innovations, _by_xla, arguments)
+    return likelihoods, whitened
 
 
 def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
@@ -196,13 +199,14 @@ def _whiten_innovations(filter: AbstractFilter, z: Array, u: Array) -> PyTree:
 
     def score_row(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return one row's log-likelihood and its whitened innovation (m,)."""
-        used = ~jnp.isnan(innovation.value)
+        is_used = ~jnp.isnan(innovation.value)
         if innovation.weight is not None:  # what a filter left out, or nearly, does not count against it
-            used &= innovation.weight >= HALF  # half of a weight
+            is_used &= innovation.weight >= HALF  # half of a weight
         # Components that are not used: 0 of variance 1, correlated with none.
-        covariance = jnp.where(used[:, None] & used, innovation.covariance, jnp.diag(jnp.where(used, 0.0, 1.0)))
-        white = whiten(covariance, jnp.where(used, innovation.value, 0.0))
-        return jnp.asarray(innovation.log_likelihood), jnp.where(used, white, jnp.nan)
+        unit_if_unused = jnp.diag(jnp.where(is_used, 0.0, 1.0))
+        covariance = jnp.where(is_used[:, None] & is_used, innovation.covariance, unit_if_unused)
+        whitened = whiten(covariance, jnp.where(is_used, innovation.value, 0.0))
+        return jnp.asarray(innovation.log_likelihood), jnp.where(is_used, whitened, jnp.nan)
 
     return filter.scan(z, u, score_row)
 

@@ -94,13 +94,13 @@ def _read_estimate(frame: "pd.DataFrame", places: _Places, values: Mapping[_Key,
     mean, covariance = values[node, name, "mean"], values[key]
     # The last level of a mean's columns numbers the states of attitudes, "0", "1" and so on; it is "" of all others.
     numbers = [frame.columns[i][LEVELS.index("other")] for i in places[node, name, "mean"]]
-    of_attitudes = len(numbers) - numbers.count("")
+    attitude_states = len(numbers) - numbers.count("")
     return Estimate(
         mean=mean,
         covariance=covariance.reshape(*mean.shape, mean.shape[-1]),
         claim=COVARIANCE[quantity],
         modes=values.get((node, name, MODES)),
-        attitude=tuple(numbers.index(str(i)) for i in range(of_attitudes)),
+        attitude=tuple(numbers.index(str(i)) for i in range(attitude_states)),
     )
 
 
@@ -113,10 +113,11 @@ def _read_uplinks(values: Mapping[_Key, np.ndarray]) -> dict[str, Uplink]:
     for node, name, quantity in values:
         if quantity == SENT[0]:
             nodes_of.setdefault(name, []).append(node)
-    return {
-        name: Uplink(tuple(nodes), *(np.stack([values[node, name, q] for node in nodes], axis=-2) for q in SENT))
-        for name, nodes in nodes_of.items()
-    }
+    uplinks = {}
+    for name, nodes in nodes_of.items():
+        sent = [np.stack([values[node, name, quantity] for node in nodes], axis=-2) for quantity in SENT]
+        uplinks[name] = Uplink(tuple(nodes), *sent)
+    return uplinks
 
 
 def _keep_labels(columns: Sequence[Column]) -> Any:

@@ -80,15 +80,16 @@ def _judge_rows(
         u: inputs of all rows.
         rows: numbers of the rows to be judged, in which one may stand several times.
     """
-    votes = []
+    judgements = []
     for name, filter in filters.items():
         states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], before[name])
         arguments = filter, states, z, u[rows], rows
         with jax.enable_x64(True):
-            code = choose_code(_judge_filter_step, arguments, (False, True, True, True, True))
-            judgement = to_numpy(_judge_by_xla(*arguments, len(rows)) if code.code is None else code.results())
-        votes.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
-    return np.stack(votes, axis=1)
+            choice = choose_code(_judge_filter_step, arguments, differs_by_run=(False, True, True, True, True))
+            results = _judge_by_xla(*arguments, len(rows)) if choice.code is None else choice.results()
+            judgement = to_numpy(results)
+        judgements.append(np.stack([np.broadcast_to(field, len(rows)) for field in judgement], axis=-1))
+    return np.stack(judgements, axis=1)
 
 
 def _judge_filter_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> Judgement:

@@ -109,17 +109,18 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
     `outcome`: outputs of a step, with the number of its column in place of each value; by kind of filter, None of kinds
     that do not weigh. FUSED is the "node" of central filters.
     """
-    parts = {
+    columns_by_place = {
         name: [np.asarray(field)[place.filter, place.node] for field in outcome["weighed"][place.kind]]
         for name, place in network.places.items()
         if outcome["weighed"][place.kind] is not None
     }
-    centrally = outcome["weighed_centrally"].items()
-    central = {(FUSED, name): list(columns) for name, columns in centrally if columns is not None}
-    return {
-        name: WeighingColumns(*(tuple(map(int, field)) for field in columns))
-        for name, columns in (parts | central).items()
-    }
+    weighed_centrally = outcome["weighed_centrally"].items()
+    central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}
+    weights = {}
+    for name, columns in (columns_by_place | central).items():
+        value, variance, weight = (tuple(map(int, field)) for field in columns)
+        weights[name] = WeighingColumns(value, variance, weight)
+    return weights
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
@@ -130,15 +131,14 @@ def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str
     judged = {"estimates": outcome["judged"], "fused": {}}
     # Each field of the judgements, of which the axes are the last two, (filter, node).
     fields = range(len(JudgementColumns._fields))
-    parts = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
+    columns_by_field = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
     by_node = {
-        node: {name: JudgementColumns(*(int(field[node][name]) for field in parts)) for name in filters}
-        for node, filters in parts[0].items()
+        node: {name: JudgementColumns(*(int(field[node][name]) for field in columns_by_field)) for name in filters}
+        for node, filters in columns_by_field[0].items()
     }
     central = outcome["judged_centrally"]
-    return by_node | {
-        FUSED: {name: JudgementColumns(*(int(column) for column in columns)) for name, columns in central.items()}
-    }
+    fused = {name: JudgementColumns(*map(int, columns)) for name, columns in central.items()}
+    return by_node | {FUSED: fused}
 
 
 def _read_field(i: int, judged: PyTree) -> np.ndarray:

@@ -35,9 +35,11 @@ class RowHistory(NamedTuple):
 
         `held` has as many inputs as a row gives.
         """
-        given = self.held.shape[1]
+        inputs = self.held.shape[1]
         numbers = self.rows[row]
-        return numbers[: -given - 1], numbers[-given - 1 : -1], numbers[-1]
+        measurements, u = numbers[: -inputs - 1], numbers[-inputs - 1 : -1]
+        time = numbers[-1]
+        return measurements, u, time
 
     def state_after(self, row: jax.Array) -> PyTree:
         """Return the filters' states after a row."""
@@ -45,9 +47,10 @@ class RowHistory(NamedTuple):
 
     def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
         """Return the inputs that led to a row: those held before it, with the time since then at place `dt`."""
-        held = self.held[row - 1]
-        (_, _, time), (_, _, time_before) = self.read_row(row), self.read_row(row - 1)
-        return jnp.concatenate([held[:dt], (time - time_before)[None], held[dt:]])
+        held_inputs = self.held[row - 1]
+        _, _, time = self.read_row(row)
+        _, _, time_before = self.read_row(row - 1)
+        return jnp.concatenate([held_inputs[:dt], (time - time_before)[None], held_inputs[dt:]])
 
     def read_step(self, row: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return measurements and inputs at step k, which is the row's or one between it and the row before.
@@ -55,7 +58,7 @@ class RowHistory(NamedTuple):
         Between rows nothing is measured (NaN), and inputs are those held since the row before, as are inputs that the
         row does not give (NaN).
         """
-        received, given, step_of_row = self.read_row(row)
-        is_row, held = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
-        u = jnp.where(is_row, jnp.where(jnp.isnan(given), held, given), held)
-        return jnp.where(is_row, received, jnp.nan), u
+        z, u_of_row, step_of_row = self.read_row(row)
+        is_row, held_inputs = k == step_of_row.astype(self.step.dtype), self.held[row - 1]
+        u = jnp.where(is_row, jnp.where(jnp.isnan(u_of_row), held_inputs, u_of_row), held_inputs)
+        return jnp.where(is_row, z, jnp.nan), u

@@ -65,10 +65,10 @@ class BackwardSweep(Module):
         # Where the row was judged at first, with the reason not to use a measurement: that holds again.
         by_kind, central = read_refusal_reasons(jax.tree.map(lambda leaf: leaf[row], history.outputs))
         skip = by_kind, {name: central[name] for name in self.network_step.filters.central}
-        after, outputs = self.network_step.filters.step(
-            state, self.network_step.group_measurements(received), u, k, skip=skip
-        )
-        return after, ({kind: outputs["smoother_steps"][kind] for kind in self.kinds}, outputs["central_steps"])
+        z = self.network_step.group_measurements(received)
+        after, outputs = self.network_step.filters.step(state, z, u, k, skip=skip)
+        steps_by_kind = {kind: outputs["smoother_steps"][kind] for kind in self.kinds}
+        return after, (steps_by_kind, outputs["central_steps"])
 
     def states_after(self, history: RowHistory, row: jax.Array) -> PyTree:
         """Return the states after a row of the filters that can be smoothed, as `AllFilters.step` takes them."""
@@ -85,9 +85,10 @@ class BackwardSweep(Module):
         """
         by_kind, central = _map_filters(lambda step, later: step.estimate_from(later), steps, later)
         # Fusions find their estimates by number of the kind: kinds that cannot be smoothed are None, and not fused.
-        parts = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
+        estimates_by_kind = [by_kind.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for fusion in self.fusions:
-            _, fused, _ = fusion.step((), parts, jnp.asarray(0))
+            no_state, step_number = (), jnp.asarray(0)
+            _, fused, _ = fusion.step(no_state, estimates_by_kind, step_number)
             central |= fused
         return by_kind, central
 
@@ -98,10 +99,13 @@ def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *r
     `rest`: its further arguments, in the form of `steps`: a pair of both.
     """
     steps_by_kind, central_steps = steps
+    function_of_stack = jax.vmap(jax.vmap(function))  # over filters and nodes
     by_kind = {}
     for kind, step in steps_by_kind.items():
-        by_kind[kind] = jax.vmap(jax.vmap(function))(step, *(rest_by_kind[kind] for rest_by_kind, _ in rest))
-    central = {name: function(step, *(by_name[name] for _, by_name in rest)) for name, step in central_steps.items()}
+        by_kind[kind] = function_of_stack(step, *(rest_by_kind[kind] for rest_by_kind, _ in rest))
+    central = {}
+    for name, step in central_steps.items():
+        central[name] = function(step, *(rest_by_name[name] for _, rest_by_name in rest))
     return by_kind, central
 
 
@@ -146,9 +150,9 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
             place, steps_after, later = carry
             steps = step_into(sweep, history, place)
             # From the estimate after the step, or at the last row from the filter's own.
-            moved_back = _map_filters(lambda step, later: step.back(later), steps_after, later)
-            ends = _map_filters(lambda step: step.end, steps)
-            later = jax.tree.map(lambda end, back: jnp.where(i == 0, end, back), ends, moved_back)
+            smoothed = _map_filters(lambda step, later: step.back(later), steps_after, later)
+            filtered = _map_filters(lambda step: step.end, steps)
+            later = jax.tree.map(lambda last, back: jnp.where(i == 0, last, back), filtered, smoothed)
             return find_earlier(history, place), steps, later
 
         start = last_row, zeros, _map_filters(lambda step: step.end, zeros)
@@ -170,7 +174,8 @@ def _make_step_into_row(dt: int) -> StepInto:
         `dt`: place of the time between rows among the inputs.
         """
         row, _ = place
-        state, (received, _, _) = sweep.states_after(history, row - 1), history.read_row(row)
+        state = sweep.states_after(history, row - 1)
+        received, _, _ = history.read_row(row)
         u = history.inputs_into_row(row, dt)
         _, smoother_steps = sweep.step(history, row, state, received, u, history.step[row])
         return smoother_steps
@@ -222,6 +227,7 @@ class RowSmoother:
     """
 
     def __init__(self, network: Network, dt: int | None):
+        """Prepare the backward sweep of the network's filters as arrays and code; `dt`: index of the time step in u."""
         instance("network", network, Network, "a Network")
         if dt is not None and not (is_whole(dt) and 0 <= dt < len(network.inputs)):
             raise fail("dt", f"the place of one of {len(network.inputs)} inputs, or None", show_value(dt))
@@ -259,7 +265,7 @@ class RowSmoother:
         if key not in self._programs:
             # Rows from `begin` to `stop`; no argument has an axis of runs, since there is one run alone.
             span = np.zeros(2, dtype=np.int32)
-            choice = choose_code(self._run, (self._numbers, history, span), [False] * 3)
+            choice = choose_code(self._run, (self._numbers, history, span), differs_by_run=[False] * 3)
             if choice.code is None:
                 self._programs[key] = lambda *arguments: to_numpy(self._by_xla(self._numbers, *arguments))
             else:
@@ -303,7 +309,7 @@ def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> E
     "none" where its mean is no number or its covariance is none.
     """
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
-    mean, covariance = (np.asarray(part)[index] for part in (outputs.mean, outputs.covariance))
+    mean, covariance = (np.asarray(stacked_values)[index] for stacked_values in (outputs.mean, outputs.covariance))
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 
@@ -313,15 +319,15 @@ def _get_filter(network: Network, kind: int, name: str) -> AbstractFilter:
 
 
 def _can_smooth(filter: AbstractFilter) -> bool:
-    """Return whether a filter can be smoothed: whether it has smoother steps, what a backward pass needs of a step.
+    """Return whether a filter can be smoothed: whether its steps return what a backward pass over the data needs.
 
-    Only the shapes of one are computed; a filter without them raises InputError.
+    Only the shapes of a step's result are computed; a filter that cannot be smoothed raises InputError.
     """
     u, z = np.zeros(len(filter.inputs)), np.zeros(filter.received)
     try:
         with jax.enable_x64(True):
             state = jax.tree.map(np.asarray, filter.init())
-            eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), filter, state)
+            eqx.filter_eval_shape(lambda filter, state: filter.step_with_smoother(state, z, u, k=0), filter, state)
     except InputError:
         return False
     return True

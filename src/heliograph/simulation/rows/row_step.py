@@ -45,10 +45,10 @@ class NetworkStep(Module):
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def __init__(self, network: Network, filters: AllFilters):
-        """Hold the filters, and by group the places of each node's measurements among those of all nodes."""
-        rows = network.rows
+        """Hold the filters, and by group of nodes the indices of each node's components in the joined measurement."""
         self.filters = filters
-        self.places = tuple(tuple(tuple(rows[name]) for name in names) for names in network.groups)
+        indices = {name: tuple(rows) for name, rows in network.rows.items()}
+        self.places = tuple(tuple(indices[name] for name in names) for names in network.groups)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, taken without implausible measurements, and the outputs.
@@ -58,7 +58,8 @@ class NetworkStep(Module):
         The outputs are "estimates" by kind and "fused" by name, and the judgements of the measurements, "judged" by
         kind and "judged_centrally" by name; "weighed" and "weighed_centrally" likewise, of filters that weigh.
         """
-        after, outputs = step_plausibly(self.filters, state, self.group_measurements(received), u, k)
+        z = self.group_measurements(received)
+        after, outputs = step_plausibly(self.filters, state, z, u, k)
         return after, {name: outputs[name] for name in OUTPUTS}
 
     def group_measurements(self, received: jax.Array) -> list[jax.Array]:
@@ -88,9 +89,10 @@ class RowLayout(NamedTuple):
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
         """Return the filters' states, the measurements, the inputs and the step number, side by side in a row."""
-        known, rest = row[: self.state.size], row[self.state.size :]
-        u, k = rest[self.received : self.received + self.inputs], rest[-1].astype(np.int64)
-        return self.state.tree(known), rest[: self.received], u, k
+        state, data_of_row = row[: self.state.size], row[self.state.size :]
+        z, u = data_of_row[: self.received], data_of_row[self.received : self.received + self.inputs]
+        k = data_of_row[-1].astype(np.int64)
+        return self.state.tree(state), z, u, k
 
 
 @readable
@@ -111,6 +113,7 @@ class RowStep:
 
     @in_float64
     def __init__(self, network: Network):
+        """Lay out state, measurement and outputs of one step of the network's filters in rows; compile the step."""
         instance("network", network, Network, "a Network")
         self._network = network
         received, inputs = sum(node.received for node in network.nodes.values()), len(network.inputs)
@@ -131,7 +134,7 @@ class RowStep:
         # Native code with the network's numbers filled in, where it takes the step.
         self._numbers = [np.asarray(leaf) for leaf in numbers]
         row = np.zeros((1, self._layout.size))
-        self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), (False, True))
+        self._choice = choose_code(_make_row_function(self._layout), (self._numbers, row), differs_by_run=(False, True))
         code = self._choice.code
         self._code = None if code is None else code.with_first_arguments(*self._numbers)
 
@@ -228,6 +231,7 @@ class OneRowStep:
     """
 
     def __init__(self, steps: RowStep, code: Any):
+        """Hold the step of many rows and the native code for one; None where XLA runs it."""
         self._steps, self._code = steps, code
 
     def __call__(self, *parts: Float[np.ndarray, "1 columns"]) -> Float[np.ndarray, "1 column"]:
@@ -236,7 +240,7 @@ class OneRowStep:
         By native code, or by XLA where there is none (`_code` is None). The next call overwrites the result.
         """
         if self._code is None:
-            return self._steps(np.concatenate(parts, axis=1), True)
+            return self._steps(np.concatenate(parts, axis=1), alone=True)
         np.concatenate(parts, axis=1, out=self._code.inputs[0])
         self._code()
         stepped: np.ndarray = self._code.outputs[0]
@@ -285,7 +289,8 @@ def _make_row_function(layout: RowLayout) -> Any:
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:
         """Step a row; return states and outputs side by side."""
-        return jnp.concatenate([flatten_to_row(tree) for tree in _make_step(layout)(numbers, row)])
+        states, outputs = _make_step(layout)(numbers, row)
+        return jnp.concatenate([flatten_to_row(states), flatten_to_row(outputs)])
 
     return step
 
@@ -317,14 +322,15 @@ def _compile_xla(layout: RowLayout, outputs: FlatLayout, width: int, together: i
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
         """Return the states and outputs after each of `width` rows, zero behind the first `turns` turns of the loop.
 
-        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step.
+        A turn steps `together` rows in parallel; `numbers`: the arrays of a network's step. Closed over: `step` of one
+        row; `layout` and `outputs`, the lengths of a row's state and outputs.
         """
 
         def step_rows(i: jax.Array, done: jax.Array) -> jax.Array:
             """Return `done` with the `together` rows of turn i stepped, in parallel, at their places."""
-            some = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
-            stepped = jax.vmap(lambda row: step(numbers, row))(some)
-            return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, 0)
+            rows_of_turn = jax.lax.dynamic_slice_in_dim(rows, i * together, together)
+            stepped = jax.vmap(lambda row: step(numbers, row))(rows_of_turn)
+            return jax.lax.dynamic_update_slice_in_dim(done, stepped, i * together, axis=0)
 
         columns = layout.state.size + outputs.size
         stepped: jax.Array = jax.lax.fori_loop(0, turns, step_rows, jnp.zeros((width, columns)))

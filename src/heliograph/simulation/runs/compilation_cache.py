@@ -50,7 +50,7 @@ def _find_default_folder() -> Path:
 
 
 def _make_private(path: Path) -> None:
-    """Make a folder to which nobody else can write; raise ValueError if it is another user's but root's (0).
+    """Make a folder to which only its owner can write; raise ValueError if it is another user's but root's (number 0).
 
     PRIVATE: the mode of a folder of its owner alone; OTHERS_WRITE: the bits by which others may write.
     """

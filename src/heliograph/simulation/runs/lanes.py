@@ -52,10 +52,11 @@ class RunLanes:
         """
         self.one_by_one = one_by_one
         self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
-        devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
-        self.wide = devices > 1 or not processor
-        # Lanes: LANES or WIDE_LANES, rounded up to a multiple of the devices.
-        self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
+        devices, is_processor = len(jax.devices()), jax.default_backend() == "cpu"
+        self.wide = devices > 1 or not is_processor
+        # Lanes: rounded up to a multiple of the devices.
+        lanes = LANES if is_processor else WIDE_LANES
+        self.count = devices * -(-lanes // devices)
         self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None
 
@@ -68,8 +69,8 @@ class RunLanes:
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
         recorded = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
-        dealt = np.concatenate(lanes)
-        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), dealt), *recorded)
+        blocks_as_dealt = np.concatenate(lanes)
+        return jax.tree.map(lambda *parts: _order_blocks(np.concatenate(parts), blocks_as_dealt), *recorded)
 
     def _run_in_threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         """Return what is recorded of each run, by lane: each lane runs in a thread of its own, carrying its sums on.
@@ -97,11 +98,11 @@ class RunLanes:
         Arguments as of `_run_in_threads`; all lanes have as many blocks. `carries`: the lanes' sums so far, a list
         before the first call, then stacked on the devices.
         """
-        shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
+        sharding = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
             carries = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
-            self.carries = jax.device_put(carries, shared)
-        runs_by_lane = jax.device_put(np.stack([runs[blocks] for blocks in lanes]), shared)
+            self.carries = jax.device_put(carries, sharding)
+        runs_by_lane = jax.device_put(np.stack([runs[blocks] for blocks in lanes]), sharding)
         self.carries, recorded = self.together(runs_by_lane, self.carries)
         on_host = to_numpy(recorded)
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
@@ -149,10 +150,12 @@ def split_into_chunks(lanes: int, wide: bool, runs: int, chunk: int) -> list[ran
         runs: how many there are.
         chunk: how many a chunk should have.
     """
-    blocks = -(-min(chunk, runs) // BLOCK)  # of a chunk, rounded up
-    if blocks >= lanes or wide:
-        blocks = lanes * -(-blocks // lanes)
-    return [range(start, start + blocks) for start in range(0, -(-runs // BLOCK), blocks)]
+    # Quotients are rounded up, -(-a // b).
+    blocks_of_chunk = -(-min(chunk, runs) // BLOCK)
+    if blocks_of_chunk >= lanes or wide:
+        blocks_of_chunk = lanes * -(-blocks_of_chunk // lanes)
+    all_blocks = -(-runs // BLOCK)
+    return [range(start, start + blocks_of_chunk) for start in range(0, all_blocks, blocks_of_chunk)]
 
 
 def advance_in_chunks(
@@ -166,12 +169,12 @@ def advance_in_chunks(
         runs: how many there are.
         progress: is called with how many runs are done, and of how many.
     """
-    parts = []
+    collected = []
     for blocks in chunks:
-        parts.append(advance(blocks.start, len(blocks)))
+        collected.append(advance(blocks.start, len(blocks)))
         if progress is not None:
             progress(min(blocks.stop * BLOCK, runs), runs)
-    return parts
+    return collected
 
 
 def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
@@ -179,11 +182,11 @@ def count_runs_by_batch(first_run: int, stop: int) -> np.ndarray:
     return np.bincount(np.arange(first_run, stop) % BATCHES, minlength=BATCHES).astype(float)
 
 
-def _order_blocks(recorded: np.ndarray, dealt: np.ndarray) -> np.ndarray:
+def _order_blocks(recorded: np.ndarray, block_numbers: np.ndarray) -> np.ndarray:
     """Return what was recorded of blocks of runs (block, BLOCK, ...) as (run, ...), in the order of the runs.
 
-    `dealt`: number of each block, as they were dealt to lanes.
+    `block_numbers`: number of each block, as they were dealt to lanes.
     """
     ordered = np.empty_like(recorded)
-    ordered[dealt] = recorded
+    ordered[block_numbers] = recorded
     return ordered.reshape(recorded.shape[0] * recorded.shape[1], *recorded.shape[2:])  # a length may be zero

@@ -44,7 +44,7 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Native code where it supports the function.
-    choice = choose_code(function, values, [True] * len(values))
+    choice = choose_code(function, values, differs_by_run=[True] * len(values))
     return choice.results() if choice.code is not None else _apply_by_xla(function, values, width)
 
 
@@ -59,15 +59,9 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     share = blocks * width
 
     def compute_share(core: int) -> PyTree:
-        """Return the results of one core's runs, `share` of all: `blocks` blocks of `width` runs in parallel.
-
-        Missing runs are filled up, and their results are cut off again.
-        """
-        first, stop = core * share, min((core + 1) * share, runs)
-        parts = [_pad_runs(a[first:stop], share).reshape(blocks, width, *a.shape[1:]) for a in values]
-        with jax.enable_x64(True):
-            outputs = to_numpy(_map_blocks(function, parts))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: stop - first], outputs)
+        """Return the results of one core's share of the runs."""
+        runs_of_core = slice(core * share, (core + 1) * share)
+        return _apply_in_blocks(function, [a[runs_of_core] for a in values], blocks, width)
 
     # Each core computes its blocks, then copies them to their place; few runs need fewer cores.
     computed = list(get_thread_pool().map(compute_share, range(-(-runs // share))))
@@ -80,6 +74,19 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
 
     list(get_thread_pool().map(copy_back, range(len(computed))))
     return results
+
+
+def _apply_in_blocks(function: Callable[..., PyTree], values: list[np.ndarray], blocks: int, width: int) -> PyTree:
+    """Return the function's results (run, ...) of `values` (run, ...), in so many blocks of `width` runs in parallel.
+
+    Missing runs are filled up, and their results are cut off again.
+    """
+    runs = len(values[0])
+    padded = [_pad_runs(a, blocks * width) for a in values]
+    by_block = [a.reshape(blocks, width, *a.shape[1:]) for a in padded]
+    with jax.enable_x64(True):
+        outputs = to_numpy(_map_blocks(function, by_block))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:runs], outputs)
 
 
 def _read_numbers(value: PyTree) -> np.ndarray:

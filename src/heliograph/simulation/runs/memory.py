@@ -58,10 +58,10 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
     total, free = sum(needed), find_available_memory()
     if free is None or total <= free:
         return
-    part, most = max(needed._asdict().items(), key=lambda item: item[1])
-    less = FEWER if part == "collected" else LESS
-    largest = f"{most / GB:.3g} GB of them {_DESCRIPTIONS[part]}"
-    got = f"{total / GB:.3g} GB for runs={runs}, horizon={horizon}, {largest}: {less}"
+    kind, largest_part = max(needed._asdict().items(), key=lambda item: item[1])
+    advice = FEWER if kind == "collected" else LESS
+    what_is_largest = f"{largest_part / GB:.3g} GB of them {_DESCRIPTIONS[kind]}"
+    got = f"{total / GB:.3g} GB for runs={runs}, horizon={horizon}, {what_is_largest}: {advice}"
     raise fail("memory of a simulation", f"at most {free / GB:.3g} GB, which are available", got)
 
 

@@ -90,7 +90,8 @@ def check_memory_of_parts(code: NativeProgram, parts: int, runs: int, horizon: i
     """
     # Memory of what is collected, of sums in each lane, and of lanes that run at once.
     lanes = min(LANES, -(-runs // BLOCK))
-    collected, sums, variables = code.begun.program.measure_memory(runs, lanes, min(lanes, os.cpu_count() or 1))
+    threads = min(lanes, os.cpu_count() or 1)
+    collected, sums, variables = code.begun.program.measure_memory(runs, lanes, threads)
     collected *= 2 if precision == "float32" else 1  # results are handed back in double precision
     # While the sums of a part are added up, the next part is computed.
     sums *= min(parts, 2)
@@ -133,11 +134,11 @@ class _KnownEntries:
         Known are zeros and ones, or all whole numbers; all else is an argument of the program. Of an argument of more
         than FEW numbers nothing is known.
         """
-        known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
+        is_known = _find_plain(array) if array.dtype.kind == "f" else np.full(array.shape, not _is_argument(array))
         if array.size > FEW and _is_argument(array):
-            known[...] = False
-        values = np.where(known, array, 0).astype(array.dtype)
-        return cls(array.shape, array.dtype.str, known.tobytes(), values.tobytes())
+            is_known[...] = False
+        values = np.where(is_known, array, 0).astype(array.dtype)
+        return cls(array.shape, array.dtype.str, is_known.tobytes(), values.tobytes())
 
     @property
     def mask(self) -> np.ndarray:
@@ -192,8 +193,8 @@ def _split_arrays(tree: PyTree) -> tuple[_Structure, tuple[np.ndarray, ...]]:
     """
     leaves, structure = jax.tree.flatten(tree)
     is_fixed = tuple(not eqx.is_array(leaf) for leaf in leaves)
-    fixed = tuple(leaf if f else None for leaf, f in zip(leaves, is_fixed, strict=True))
-    arrays = tuple(np.asarray(leaf) for leaf, f in zip(leaves, is_fixed, strict=True) if not f)
+    fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    arrays = tuple(np.asarray(leaf) for leaf in leaves if eqx.is_array(leaf))
     return _Structure(structure, fixed, is_fixed, tuple(map(_KnownEntries.of, arrays))), arrays
 
 
@@ -233,17 +234,16 @@ def _compile_program(of_world: _Structure, of_rest: _Structure, precision: Preci
         """Return what is summed over runs, and what is kept of this one, from all arrays and, last, its number."""
         *arrays, number = leaves
         remaining = iter(arrays)
-        world, (later, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
+        world, (smoother, inputs, reducer) = of_world.restore(remaining), of_rest.restore(remaining)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
-        if later is None:
+        if smoother is None:
             reduced = _simulate_run(world, u, reducer, run_key)
         else:
-            reduced = _simulate_smoothed_run(world, later, u, reducer, run_key)
+            reduced = _simulate_smoothed_run(world, smoother, u, reducer, run_key)
         # Sums over runs by batch; flags too, which hold for a batch if the sum is above zero.
-        summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
-        sums, ever = summed
+        sums, ever = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (reduced.sums, reduced.ever))
         result_trees[:] = [jax.tree.structure(OfStep(sums, ever, reduced.collected))]
-        return summed, reduced.collected
+        return (sums, ever), reduced.collected
 
     # Traced with a key, argument 0, and examples of the arrays, of which some entries are known.
     key, known = jax.eval_shape(lambda: jax.random.key(0)), of_world.known + of_rest.known
@@ -278,11 +278,11 @@ def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any]
 
 
 def _simulate_smoothed_run(
-    world: World, later: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
+    world: World, smoother: NetworkSmoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
 ) -> OfStep:
     """Return what the reducer makes of one run's filtered and smoothed estimates, as `reduce_run` does.
 
-    The world: plant, channels and filters; `later` smooths their estimates when the run is over.
+    The world: plant, channels and filters; `smoother` smooths their estimates when the run is over.
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
@@ -290,7 +290,7 @@ def _simulate_smoothed_run(
         return _step_world(world, state, key, row)
 
     _, outputs = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    return reduce_run(reducer, later, outputs)
+    return reduce_run(reducer, smoother, outputs)
 
 
 def simulate_natively(
@@ -355,14 +355,14 @@ def _simulate_in_parts(
     parts, memory = count_parts(network), list[list[np.ndarray]]()
     results: list[Result] = []
 
-    def finish_part(started: NativeRuns, some: Network) -> None:
+    def finish_part(started: NativeRuns, part: Network) -> None:
         """Append the result of the next of `parts` parts of a network to `results`; show its progress in the whole."""
 
         def show_progress(done: int, total: int) -> None:
             if progress is not None:
                 progress((len(results) * total + done) // parts, total)
 
-        results.append(finish_result(reducer, started.complete(show_progress), some, None))
+        results.append(finish_result(reducer, started.complete(show_progress), part, smoothing=None))
 
     # Threads compute a part while the part before it is finished and the next one is made ready.
     running: tuple[NativeRuns, Network] | None = None
@@ -396,5 +396,5 @@ def compile_network_runs(
     `smoothing`: the part of it whose estimates are smoothed, None for none.
     """
     world = build_world(network, None if smoothing is None else smoothing.kinds)
-    later = None if smoothing is None else smoothing.smoother(world.filters)
-    return compile_runs(world, inputs, key, reducer, runs, later, precision=precision)
+    smoother = None if smoothing is None else smoothing.smoother(world.filters)
+    return compile_runs(world, inputs, key, reducer, runs, smoother, precision=precision)

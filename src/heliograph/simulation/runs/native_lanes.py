@@ -59,7 +59,7 @@ class NativeRuns:
         self.code, self.first_run, self.runs = code, first_run, runs
         self.memory: list[list[np.ndarray]] = [] if memory is None else memory
         self.sums: list[list[np.ndarray] | None] = [None] * LANES
-        self.chunks = split_into_chunks(LANES, False, runs, chunk)
+        self.chunks = split_into_chunks(LANES, wide=False, runs=runs, chunk=chunk)
         self._first = self._start(self.chunks[0])
 
     def complete(self, progress: Progress | None) -> ReducedRuns:
@@ -67,8 +67,8 @@ class NativeRuns:
 
         `progress` is called after each chunk with how many runs are done, and of how many.
         """
-        parts = advance_in_chunks(self._advance, self.chunks, self.runs, progress)
-        return self._total()._replace(collected=self._join_chunks(parts))
+        collected_by_chunk = advance_in_chunks(self._advance, self.chunks, self.runs, progress)
+        return self._total()._replace(collected=self._join_chunks(collected_by_chunk))
 
     def _start(self, blocks: range) -> "_RunningChunk":
         """Let threads simulate these blocks, each lane's in order."""
@@ -96,8 +96,8 @@ class NativeRuns:
         # Each leaf of all lanes, with the runs sorted by their numbers; None where all runs share it.
         order = np.argsort(running.runs, kind="stable")
         leaves: list[np.ndarray | None] = []
-        for parts in zip(*running.collected_by_lane, strict=True):
-            leaves.append(None if parts[0] is None else to_double(np.concatenate(parts)[order]))
+        for values_by_lane in zip(*running.collected_by_lane, strict=True):
+            leaves.append(None if values_by_lane[0] is None else to_double(np.concatenate(values_by_lane)[order]))
         return leaves
 
     def _list_runs(self, blocks: np.ndarray) -> np.ndarray:
@@ -124,19 +124,19 @@ class NativeRuns:
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
         return ReducedRuns(sums=sums, common=same, runs=count, collected=None)
 
-    def _join_chunks(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
+    def _join_chunks(self, collected_by_chunk: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return what is collected of all runs (run, ...), from what `_advance` returned of each chunk of them.
 
         A result that all runs share (`shared`, else None) is a view of one.
         """
         leaves: list[Any] = []
-        for fixed, *chunks in zip(self.code.begun.shared, *parts, strict=True):
-            if fixed is not None:
-                leaves.append(np.broadcast_to(to_double(fixed), (self.runs, *fixed.shape)))
-            elif len(chunks) > 1 and chunks[0] is not None:
-                leaves.append(np.concatenate(chunks))
+        for shared_value, *values_by_chunk in zip(self.code.begun.shared, *collected_by_chunk, strict=True):
+            if shared_value is not None:
+                leaves.append(np.broadcast_to(to_double(shared_value), (self.runs, *shared_value.shape)))
+            elif len(values_by_chunk) > 1 and values_by_chunk[0] is not None:
+                leaves.append(np.concatenate(values_by_chunk))
             else:  # one chunk is not copied; None is what is not collected
-                leaves.append(chunks[0])
+                leaves.append(values_by_chunk[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected
 
 

@@ -20,7 +20,7 @@ from heliograph.simulation.node import Node
 from heliograph.simulation.runs.stacked_filters import StackedFilters
 from heliograph.simulation.simulation_step import World
 from heliograph.simulation.transmission.build_reception import make_reception
-from heliograph.simulation.transmission.reception import SeparateChannels
+from heliograph.simulation.transmission.medium import SeparateChannels
 
 M = TypeVar("M", bound=Module)
 
@@ -33,8 +33,9 @@ def is_apart(network: Network) -> bool:
     Then a few nodes can be simulated by themselves, with the same results.
     """
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    fused = network.fused or network.meshes
-    return len(nodes) == len(network.nodes) and not fused and not any(first(n.channel).remembers for n in nodes)
+    all_have_filters = len(nodes) == len(network.nodes)
+    are_fused = network.fused or network.meshes
+    return all_have_filters and not are_fused and not any(first(node.channel).remembers for node in nodes)
 
 
 @cache_by_object
@@ -60,14 +61,14 @@ def split_nodes(network: Network) -> tuple[tuple[Network, World], ...]:
     The nodes of a structure are stacked once, and a part takes its rows: to stack those of each part would take longer
     than to simulate three hundred runs, and so would to split the network again for each simulation of it.
     """
-    parts = []
+    networks_with_worlds = []
     for names in network.groups:
-        alike = _select_nodes(network, names)
-        world = jax.tree.map(_on_host, build_world(alike))
+        network_of_group = _select_nodes(network, names)
+        world = jax.tree.map(_on_host, build_world(network_of_group))
         for start in range(0, len(names), NODES):
-            some = slice(start, start + NODES)
-            parts.append((_select_nodes(network, names[some]), _select_rows(world, some)))
-    return tuple(parts)
+            node_range = slice(start, start + NODES)
+            networks_with_worlds.append((_select_nodes(network, names[node_range]), _select_rows(world, node_range)))
+    return tuple(networks_with_worlds)
 
 
 def _on_host(leaf: PyTree) -> PyTree:
@@ -95,10 +96,11 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
 
 def _with_fields(module: M, **changed: object) -> M:
     """Return a copy of a module with these fields changed, without its constructor, which would compute them."""
-    new = object.__new__(type(module))
+    changed_copy = object.__new__(type(module))
     for field in fields(module):
-        object.__setattr__(new, field.name, changed.get(field.name, getattr(module, field.name)))
-    return new
+        value = changed.get(field.name, getattr(module, field.name))
+        object.__setattr__(changed_copy, field.name, value)  # fields are frozen
+    return changed_copy
 
 
 def _select_rows(world: World, nodes: slice) -> World:

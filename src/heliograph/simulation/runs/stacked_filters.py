@@ -89,7 +89,8 @@ def get_weighed_components(innovation: Innovation) -> Weighed | None:
     """
     if innovation.weight is None:
         return None
-    return Weighed(jnp.asarray(innovation.value), jnp.diagonal(innovation.covariance), jnp.asarray(innovation.weight))
+    variance = jnp.diagonal(innovation.covariance)
+    return Weighed(jnp.asarray(innovation.value), variance, jnp.asarray(innovation.weight))
 
 
 class StackedFilters(Module):
@@ -143,22 +144,32 @@ class StackedFilters(Module):
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), outputs)
 
     def compute_by_node(
-        self, function: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+        self,
+        function: Callable[..., object],
+        states: PyTree,
+        filter_number: int,
+        z: jax.Array,
+        u: jax.Array,
+        k: jax.Array,
     ) -> PyTree:
         """Return function(filter, state, z, u, k) of filter number f at each node, with a leading axis of nodes.
 
         `states`: of all filters before step k. `z`: measurements (node, received).
         """
-        filters, states = self.take_filter(f, states)
+        filters, states = self.take_filter(filter_number, states)
         return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
 
-    def take_filter(self, f: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
+    def take_filter(self, filter_number: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
         """Return filter number f of each node and its state out of `states`, both with a leading axis of nodes."""
-        rows = slice(f * self.nodes, (f + 1) * self.nodes)  # all nodes of the first filter stand first, and so on
-        taken: tuple[AbstractFilter, PyTree] = jax.tree.map(
-            lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, (self.filters, states)
-        )
-        return taken
+        begin = filter_number * self.nodes  # all nodes of the first filter stand first, and so on
+        rows = slice(begin, begin + self.nodes)
+
+        def take_rows(leaf: PyTree) -> PyTree:
+            """Return the rows of an array, anything else as it is."""
+            return leaf[rows] if eqx.is_array(leaf) else leaf
+
+        filter, state = jax.tree.map(take_rows, (self.filters, states))
+        return filter, state
 
 
 def initial_state(filter: AbstractFilter) -> PyTree:

@@ -91,10 +91,15 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
 def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
     """Return the leaves of `values` (or their shapes) on which some result of the function depends."""
     leaves, tree = jax.tree.flatten(values)
-    traced = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)))(*leaves)
+
+    def call_with_leaves(*leaves: PyTree) -> PyTree:
+        """Return the function's result for values of these leaves."""
+        return function(jax.tree.unflatten(tree, leaves))
+
+    traced = jax.make_jaxpr(call_with_leaves)(*leaves)
     # JAX's removal of dead code says which arguments are used.
-    _, used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
-    return [leaf for leaf, is_used in zip(leaves, used, strict=True) if is_used]
+    _, are_used = dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+    return [leaf for leaf, is_used in zip(leaves, are_used, strict=True) if is_used]
 
 
 def _start_runs(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
@@ -119,11 +124,11 @@ def _find_dependent_variables(program: ClosedJaxpr, inputs: Sequence[bool]) -> s
 
     Each operation is assumed to use all its arguments.
     """
-    marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
+    dependent = {variable for variable, is_marked in zip(program.jaxpr.invars, inputs, strict=True) if is_marked}
     for operation in program.jaxpr.eqns:
-        if any(v in marked for v in operation.invars if not isinstance(v, Literal)):
-            marked.update(operation.outvars)
-    return marked
+        if any(v in dependent for v in operation.invars if not isinstance(v, Literal)):
+            dependent.update(operation.outvars)
+    return dependent
 
 
 def _mark_dependent_results(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:

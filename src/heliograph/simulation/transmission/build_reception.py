@@ -15,7 +15,7 @@ from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.random_keys import checksum
 from heliograph.simulation.transmission.channel_draws import number_memory_seeds
-from heliograph.simulation.transmission.reception import (
+from heliograph.simulation.transmission.medium import (
     AbstractMedium,
     CommonChannel,
     NodeGroup,
@@ -49,12 +49,14 @@ def make_reception(network: Network) -> AbstractMedium:
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
     """Return the medium of a network's relays: how they send to each other in slots, one after another in a step."""
-    listeners = {name: i for i, name in enumerate(relays.filters)}
+    number_of_listener = {name: i for i, name in enumerate(relays.filters)}
+    listeners_by_group = [tuple(number_of_listener[name] for name in names) for names in network.groups]
+    hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}
     return SlottedRelays(
         relays=relays,
         estimates_at=tuple(network.places[name, LOCAL] for name in relays.relays),
-        groups=tuple(tuple(listeners[name] for name in names) for names in network.groups),
-        memories=number_memory_seeds({name: hop.channel for name, hop in find_hops_with_memory(relays).items()}),
+        groups=tuple(listeners_by_group),
+        memories=number_memory_seeds(hops),
     )
 
 
@@ -107,6 +109,8 @@ def _split_seeds(observed: tuple[AnySensor, Channel], seeds: np.ndarray) -> tupl
     A memory that they share is in both.
     """
     # A memory's identity: its name, or one of its own.
-    by_identity = dict(zip(memories(observed), seeds, strict=True))
-    of_sensor, of_channel = ([by_identity[identity] for identity in memories(part)] for part in observed)
+    seed_by_identity = dict(zip(memories(observed), seeds, strict=True))
+    sensor, channel = observed
+    of_sensor = [seed_by_identity[identity] for identity in memories(sensor)]
+    of_channel = [seed_by_identity[identity] for identity in memories(channel)]
     return np.array(of_sensor, np.uint32), np.array(of_channel, np.uint32)

@@ -56,13 +56,14 @@ def number_memory_seeds(channels: Mapping[str, PyTree], plant: PyTree = ()) -> d
     """
     of_plant = {identity: i for i, identity in enumerate(memories(plant))}
     # One object under many names is looked at once.
-    objects = {id(channel): channel for channel in channels.values()}
-    memories((plant, tuple(objects.values())))  # raises where one name stands for memories that differ
-    memories_of = {key: memories(channel) for key, channel in objects.items()}
+    channel_by_id = {id(channel): channel for channel in channels.values()}
+    memories((plant, tuple(channel_by_id.values())))  # raises where one name stands for memories that differ
+    memories_of = {key: memories(channel) for key, channel in channel_by_id.items()}
     unique_memories(memory for by_identity in memories_of.values() for memory in by_identity.values())  # raises too
     numbers = {}
     for name, channel in channels.items():
-        sources = [_name_source(m, i, name, of_plant) for i, m in enumerate(memories_of[id(channel)].values())]
+        of_channel = memories_of[id(channel)].values()
+        sources = [_name_source(memory, i, name, of_plant) for i, memory in enumerate(of_channel)]
         numbers[name] = np.array([checksum(source) for source in sources], dtype=np.uint32)
     return numbers
 
@@ -138,16 +139,17 @@ def start_channel(channel: Channel, key: jax.Array, source: Number, shared: Memo
 
     `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
     """
-    link, link_key = at(channel, 0), draw_key(key, 0, source, CHANNEL_START)
-    keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
+    link, link_key = at(channel, k=0), draw_key(key, k=0, source=source, purpose=CHANNEL_START)
+    keys = [draw_key(key, k=0, source=memory, purpose=MEMORY_START) for memory in shared]
     state = init_with_shared_memories(link, link_key, keys) if len(shared) else link.init(link_key)
-    return LateChannelState(state, jnp.zeros(link.past * signal_size(link))) if link.past else state
+    past_signals = jnp.zeros(link.past * signal_size(link))
+    return LateChannelState(state, past_signals) if link.past else state
 
 
 def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
     """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
     numbered = zip(memories(models).values(), shared, strict=True)
-    return tuple(memory.begin(draw_key(key, 0, number, MEMORY_START)) for memory, number in numbered)
+    return tuple(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)) for memory, number in numbered)
 
 
 def move_modes(
@@ -157,8 +159,8 @@ def move_modes(
 
     `shared`: numbers that seed their draws; memories of one number move alike.
     """
-    moves = zip(memories(models).values(), states, shared, strict=True)
-    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in moves)
+    states_and_seeds = zip(memories(models).values(), states, shared, strict=True)
+    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in states_and_seeds)
 
 
 def deliver_signal(
@@ -166,15 +168,16 @@ def deliver_signal(
 ) -> tuple[PyTree, jax.Array]:
     """Return a channel's next state, and what it makes of y at step k, a late one of past signals too.
 
-    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories.
+    `source`: number that seeds its own draws; `shared`: numbers that seed those of its memories. `matrix`: [G n; 0 1]
+    as drawn.
     """
     link, link_key = at(channel, k), draw_key(key, k, source, CHANNEL)
     if link.past:  # a late link carries y and the signals before it, the last first
-        line = jnp.concatenate([y, state.line])
-        after, h = _draw_link(link, state.channel, key, k, link_key, shared)
-        return LateChannelState(after, line[: -len(y)]), apply(h, line)
-    state, h = _draw_link(link, state, key, k, link_key, shared)
-    return state, apply(h, y)
+        signals = jnp.concatenate([y, state.line])
+        after, matrix = _draw_link(link, state.channel, key, k, link_key, shared)
+        return LateChannelState(after, signals[: -len(y)]), apply(matrix, signals)
+    state, matrix = _draw_link(link, state, key, k, link_key, shared)
+    return state, apply(matrix, y)
 
 
 def _draw_link(
@@ -186,4 +189,5 @@ def _draw_link(
     """
     if not len(shared):
         return link.draw(state, link_key)
-    return draw_with_shared_memories(link, state, link_key, [draw_key(key, k, memory, MEMORY) for memory in shared])
+    memory_keys = [draw_key(key, k, number, MEMORY) for number in shared]
+    return draw_with_shared_memories(link, state, link_key, memory_keys)

@@ -42,12 +42,14 @@ def transmit(signal: Float[ArrayLike, "*shape"], channel: Channel, seed: int = 0
     """
     instance("channel", first(channel), AbstractRandomAffine, "a channel, such as hop(...)")
     inputs = first(channel).inputs
-    flat = inputs == 1 and rank("signal", signal) == 1
-    y = array("signal", signal, (None,) if flat else (None, inputs), missing=True).reshape(-1, inputs)
+    is_one_axis = inputs == 1 and rank("signal", signal) == 1
+    shape = (None,) if is_one_axis else (None, inputs)
+    y = array("signal", signal, shape, missing=True).reshape(-1, inputs)
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))
-    return np.asarray(compute_once(_transmit_all, _by_xla, (channel, y, np.asarray(check_seed("seed", seed)))))
+    arguments = channel, y, np.asarray(check_seed("seed", seed))
+    return np.asarray(compute_once(_transmit_all, _by_xla, arguments))
 
 
 def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
@@ -58,15 +60,17 @@ def _transmit_all(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> 
     key = jax.random.key(seed)
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-        """Return the channel's next state, and what arrives of y in row k; h = [G n; 0 1] is the channel as drawn."""
+        """Return the channel's next state, and what arrives of y in row k; `matrix`: the drawn [G n; 0 1]."""
         k, y_k = row
-        missing = jnp.isnan(y_k)
-        state, h = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
-        # Outputs to which G, h without its last row and column, carries a number that was not sent.
-        unsent = jnp.any((h[:-1, :-1] != 0) & missing, axis=1)
-        return state, jnp.where(unsent, jnp.nan, apply(h, jnp.where(missing, 0.0, y_k)))
+        is_missing = jnp.isnan(y_k)
+        state, matrix = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
+        # Outputs to which the gain carries a number that was not sent.
+        gain = matrix[:-1, :-1]
+        lacks_input = jnp.any((gain != 0) & is_missing, axis=1)
+        received = apply(matrix, jnp.where(is_missing, 0.0, y_k))
+        return state, jnp.where(lacks_input, jnp.nan, received)
 
-    start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
+    start = at(channel, k=0).init(draw_key(key, k=0, source=SENDER, purpose=CHANNEL_START))
     received: jax.Array
     _, received = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))
     return received
@@ -97,7 +101,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     results: list[Arrival] = []
     # Node by node; a value of step k - delay arrives at step k.
     for name, z in record.measurements.items():
-        values = z if z.ndim == 2 else z[check_count("run", run, 0)]
+        values = z if z.ndim == 2 else z[check_count("run", run, least=0)]
         values, delays = _separate_delays(name, network.nodes[name], values)
         arrived = ~np.isnan(values).all(axis=1) & ~np.isnan(delays)
         for k in np.flatnonzero(arrived):

@@ -17,7 +17,7 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.network_index import EstimatePlace
 from heliograph.simulation.random_keys import SENSOR, Number, checksum, draw_key
 from heliograph.simulation.transmission.channel_draws import deliver_signal, start_channel
-from heliograph.simulation.transmission.reception import AbstractMedium, Measurements
+from heliograph.simulation.transmission.medium import AbstractMedium, Measurements
 
 
 class RelayStates(NamedTuple):
@@ -46,7 +46,7 @@ class SlottedRelays(AbstractMedium):
 
     def init(self, key: jax.Array) -> RelayStates:
         """Return the initial mean as every relay's estimate, and the initial states of the hops with memory."""
-        mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
+        mean = jnp.asarray(at(self.relays.plant, k=0).initial_mean)
         hops = {
             name: start_channel(hop.channel, key, hop.source, self.memories[name])
             for name, hop in find_hops_with_memory(self.relays).items()
@@ -166,12 +166,13 @@ def _receive_sum(
         sent: signal of each sender, by name.
         key: of the run.
     """
-    parts = []
+    received = []
     for sender, hop in hops.items():
         if not first(hop).remembers:  # its state is ()
-            _, z = deliver_signal(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())
-            parts.append(z)
-    if parts:
-        return jnp.sum(jnp.stack(parts), axis=0)
+            source = checksum(f"{sender} to {listener}")
+            _, z = deliver_signal(hop, (), sent[sender], key, k, source, shared=())
+            received.append(z)
+    if received:
+        return jnp.sum(jnp.stack(received), axis=0)
     # Hops with memory alone are added elsewhere.
     return jnp.zeros(size) if hops else jnp.full(size, jnp.nan)

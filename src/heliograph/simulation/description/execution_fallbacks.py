@@ -18,10 +18,10 @@ SHOWN = 3  # of many that are refused for one reason
 
 def explain_xla_fallbacks(network: Network) -> list[str]:
     """Return a line for each reason for which XLA, not this library's native code, computes filters: who, and why."""
-    by_reason: dict[str, list[str]] = {}
-    for who, why in (*_find_refused_filters(network), *_find_refused_meshes(network)):
-        by_reason.setdefault(why, []).append(who)
-    return [f"{_join_first_names(refused)}: {why}" for why, refused in by_reason.items()]
+    names_by_reason: dict[str, list[str]] = {}
+    for name, reason in (*_find_refused_filters(network), *_find_refused_meshes(network)):
+        names_by_reason.setdefault(reason, []).append(name)
+    return [f"{_join_first_names(refused)}: {reason}" for reason, refused in names_by_reason.items()]
 
 
 def describe_sequential_filters(network: Network) -> str:
@@ -33,18 +33,18 @@ def describe_sequential_filters(network: Network) -> str:
 def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
     """Yield each filter of the network, with who it is in words."""
     central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-    places = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
-    for where, filters in (*places, ("", central)):
-        yield from ((f"filter {label!r}{where}", filter) for label, filter in filters.items())
+    filters_by_place = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
+    for place_in_words, filters in (*filters_by_place, ("", central)):
+        yield from ((f"filter {label!r}{place_in_words}", filter) for label, filter in filters.items())
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each filter whose step native code refuses, so that XLA computes it, with the reason."""
-    for who, named in _list_filters(network):
-        filter = without_output_names(named)  # so that filters of one structure are compiled once
+    for name, filter_with_names in _list_filters(network):
+        filter = without_output_names(filter_with_names)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
-        if why := explain_refusal(_step_filter, filter, filter.init(), z, u, np.asarray(0)):
-            yield who, why
+        if reason := explain_refusal(_step_filter, filter, filter.init(), z, u, np.asarray(0)):
+            yield name, reason
 
 
 def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
@@ -57,8 +57,9 @@ def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
     """Yield each fusion between neighbours whose step is too long to be written out as native code, with the reason."""
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
-        # Those of more than DENSE nodes cannot be built where the joint covariance of their errors is needed.
-        if (nodes <= DENSE or not fusion.rule.needs_joint) and build_mesh(network, name).has_long_step:
+        # Of more than DENSE nodes none is built where the joint covariance of their errors is needed: a run refuses it.
+        can_be_built = nodes <= DENSE or not fusion.rule.needs_joint
+        if can_be_built and build_mesh(network, name).has_long_step:
             yield f"fusion {name!r}", f"between {nodes} neighbours, too many to be written out"
 
 

@@ -78,7 +78,7 @@ def test_a_filter_of_one_s_own_that_is_refused_is_named_with_its_line():
     item = network({"own": Own(by_svd=True), "kalman": hg.kalman_filter(PLANT, SENSOR)}, 5)
     (line,) = list_fallbacks(item)
     names = "filter 'own' of node 'n0', filter 'own' of node 'n1', filter 'own' of node 'n2' and 2 more"
-    assert line.startswith(f"{names}: svd at ") and "test_slow_filters.py:" in line
+    assert line.startswith(f"{names}: svd at ") and "test_execution_fallbacks.py:" in line
 
 
 def test_filters_whose_outputs_have_other_names_are_compiled_once(monkeypatch):

@@ -156,7 +156,8 @@ class SeparateChannels(AbstractMedium):
             """
             if isinstance(group, NodesWithoutSensor):
                 return link, jnp.zeros((group.count, 0))
-            transmit = map_all(lambda node, state: _transmit(node, state, x, u, key, k), len(group.checksums))
+            nodes = len(group.checksums)
+            transmit = map_all(lambda node, state: _transmit(node, state, x, u, key, k), nodes)
             return cast(tuple[PyTree, jax.Array], transmit(group, link))
 
         results = [receive_group(group, link) for group, link in zip(self.groups, state, strict=True)]
@@ -175,8 +176,8 @@ class SeparateChannels(AbstractMedium):
             """
             if group.informed_at is None:
                 return link
-            kind, f = group.informed_at
-            return link._replace(feed_back=estimates[kind].mean[f])
+            kind, filter = group.informed_at
+            return link._replace(feed_back=estimates[kind].mean[filter])
 
         return tuple(feed_group(group, link) for group, link in zip(self.groups, state, strict=True))
 
@@ -266,5 +267,5 @@ class CommonChannel(AbstractMedium):
         """
         sensor, source = at(self.sensor, k), checksum(SENDER)
         y = measure(sensor, x, draw_key(key, k, source, SENSOR))
-        state, z = deliver_signal(self.channel, state, y, key, k, source, ())
+        state, z = deliver_signal(self.channel, state, y, key, k, source, shared=())
         return state, tuple(z[rows] for rows in self.rows)

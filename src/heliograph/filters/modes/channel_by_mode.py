@@ -1,0 +1,55 @@
+"""Moments of a channel at one step in each mode of its links, and the modes' transition from the step before."""
+
+from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, unstack, vary_over_steps
+from heliograph.numerics.module import Module
+from heliograph.numerics.numpy_or_jax import stack_parts
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.second_moments import join_gain_and_noise, nominal_spread, split_off_noise
+
+
+class ChannelByMode(Module):
+    """A channel at one step, mode by mode: E[(G, n) | mode], and what (G, n) varies by about it.
+
+    transition: of the modes from the step before to this one; radius: bound on the error of each of its entries;
+    gain_spread and noise: as in `SecondOrder`, for each mode.
+
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), gain_spread (M, m, m, p + 1, p + 1), noise (M, m, m).
+    """
+
+    transition: Float[Array, "M M"]
+    radius: Float[Array, "M M"]
+    mean: Float[Array, "M m p1"]
+    gain_spread: Float[Array, "M m m p1 p1"]
+    noise: WeightedColumns
+
+    @property
+    def spread(self) -> Float[Array, "M m m p1 p1"]:
+        """E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor."""
+        spread: Array = join_gain_and_noise(self.gain_spread, self.noise)
+        return spread
+
+
+def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array, " M"], ChannelByMode | OverTime]:
+    """Return the law of the modes at the first step, and the channel by mode; links without memory have one mode.
+
+    `beside`: plant and sensor, whose modes come before the channel's.
+    """
+    steps = [joint_modes(step, beside=beside) for step in unstack(channel)]
+    steps_before = [steps[0], *steps[:-1]]
+    models = [channel_by_mode(step, before) for step, before in zip(steps, steps_before, strict=True)]
+    return steps[0].initial, vary_over_steps(models, channel)
+
+
+def channel_by_mode(now: JointModes, before: JointModes) -> ChannelByMode:
+    """Return the moments of the channel by mode at one step, and the transition from the step before."""
+    mean = stack_parts([affine.moments(1).mean[:-1] for affine in now.maps])
+    gains, noises = zip(*(split_off_noise(nominal_spread(affine).center) for affine in now.maps), strict=True)
+    noise = WeightedColumns(
+        stack_parts([noise.matrix for noise in noises]), stack_parts([noise.weights for noise in noises])
+    )
+    return ChannelByMode(
+        transition=before.transition, radius=before.radius, mean=mean, gain_spread=stack_parts(gains), noise=noise
+    )
