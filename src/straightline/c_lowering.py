@@ -33,10 +33,11 @@ class ZeroFoldingGraph(Graph):
     """
 
     def __init__(self) -> None:
+        """Make an empty graph, in which nothing is known to be finite yet: neither an input nor a number."""
         super().__init__()
         # What is finite for certain: 0 times such a number is 0, and needs no operation.
         self.finite_buffers: set[Buffer] = set()  # inputs that hold no NaN
-        self.finite: set[Node] = set()  # numbers that follow from these alone
+        self.finite: set[Node] = set()  # numbers that are computed from these alone
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node (scalar operation), 0 for a product of zero and a number that is finite whatever the data.
@@ -69,6 +70,7 @@ class CLowering(Lowering):
     """Lowering into a `ZeroFoldingGraph`: written out, with known arrays as tables that a step can index."""
 
     def __init__(self) -> None:
+        """Make a lowering into an empty `ZeroFoldingGraph`, which drops products of zero with finite numbers."""
         super().__init__()
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 

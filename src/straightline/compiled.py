@@ -34,6 +34,7 @@ class CompiledFunction:
     """
 
     def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
+        """Write the code as text of LLVM, which the first call compiles; the class says what the arguments are."""
         self.differs = list(differs)
         self.types = [DTYPES[b.type] for b in program.inputs]
         self.shapes = [b.shape for b in program.inputs]
@@ -273,6 +274,7 @@ class SingleRunCode:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
+        """Write and compile the code of one run, and allocate its memory; the class says what `in_place` is."""
         every, (_name, _flags, fuses) = [True] * len(program.inputs), find_processor_features()
         self.code = write_module(program, differing=every, width=1, fuse=fuses, alone=True, last=in_place)
         level = int(self.code.operations <= ALONE)  # 1, with care, unless the program is long

@@ -20,7 +20,8 @@ class Graph:
     """
 
     def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
-        self.max_nodes = max_nodes  # of all blocks together; one more is refused
+        """Make a graph with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
+        self.max_nodes = max_nodes
         self.top = Block(None)  # the outermost block, around all loops
         self.current = self.top  # the open block
         self.serial = 0  # number of the last node that was made; nodes are counted from 1

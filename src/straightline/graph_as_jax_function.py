@@ -38,6 +38,7 @@ class _JaxEvaluation:
     """Values of nodes and numbers in memory while JAX traces the function."""
 
     def __init__(self, program: Program):
+        """Find the nodes that a program's results need; raise Unsupported where a result is a random key."""
         self.program = program
         nodes = [n for x in program.outputs if not isinstance(x, StridedArray) for n in x.ravel().tolist()]
         if not all(isinstance(n, Node) for n in nodes):

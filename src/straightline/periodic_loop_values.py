@@ -152,9 +152,12 @@ class RingBuffer:
     """Memory for rows of some numbers of these types, one buffer for each type; filled in the turns of a loop."""
 
     def __init__(self, graph: Graph, types: Sequence[Type], loop: Loop, rows: int = RING):
-        counts = Counter(types)
-        buffers = {type: Buffer("scratch", type, (rows, counts[type]), loop.block) for type in counts}
-        self._graph, self._places = graph, [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
+        """Allocate memory around a loop for the newest `rows` rows, each of one number of each of `types`."""
+        count_by_type = Counter(types)
+        buffers = {type: Buffer("scratch", type, (rows, n), loop.block) for type, n in count_by_type.items()}
+        self._graph = graph
+        # Of each number of a row its buffer and its column there: how many numbers of its type come before it.
+        self._places = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
         """Store these numbers, in the order of the types, as a row of the ring."""

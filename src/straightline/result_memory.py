@@ -25,6 +25,7 @@ class _LoanedBytes:
     """Kept bytes lent to an array: NumPy holds this object for it and its views, and drops it with the last one."""
 
     def __init__(self, memory: np.ndarray):
+        """Hold the array of bytes that is lent, and offer it to NumPy."""
         self._memory = memory
         # NumPy's protocol, by which an array of this object's bytes holds the object.
         self.__array_interface__ = memory.__array_interface__

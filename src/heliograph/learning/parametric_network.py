@@ -132,6 +132,7 @@ class FreeNumberCollector:
     """Reader that collects the free numbers, each at its start; checks of their places report their domains."""
 
     def __init__(self) -> None:
+        """Begin without free numbers; `marks` will hold each in the order in which it is read."""
         self.marks: list[_MarkedNumber] = []
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
@@ -167,6 +168,13 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
+        """Hold values by the names of parameters, and the order of the names that the user did not give.
+
+        Args:
+            parameters: all free numbers, in the order of their places.
+            named: of each whether the user gave it a name; the others are found by that order.
+            values: the value of each parameter, by its name.
+        """
         self.values = values
         self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
 

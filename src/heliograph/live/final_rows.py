@@ -13,6 +13,7 @@ class FinalRows:
     """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
 
     def __init__(self, most: int, size: int):
+        """Begin without rows; at least the newest `most` rows are kept, of `size` numbers each."""
         self.most, self.size, self._parts = most, size, deque[tuple[np.ndarray, np.ndarray]]()
         self._count = 0  # rows of all parts
 
@@ -39,6 +40,7 @@ class GateCounts:
     """Counts of the values that filters left out of rows, by node and filter that weighs what arrives."""
 
     def __init__(self, filters: Iterable[FilterColumns]):
+        """Begin with counts of zero for each filter that weighs; note the columns of its weights in a row."""
         self._columns = {(f.node, f.filter): list(f.weighed.weight) for f in filters if f.weighed is not None}
         self.counts = dict.fromkeys(self._columns, 0)
 

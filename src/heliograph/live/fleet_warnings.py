@@ -18,6 +18,7 @@ class RemarkWatch:
     """
 
     def __init__(self, fleet: Fleet):
+        """Begin with counts of zero for each filter of the fleet that can remark on its state."""
         self._pool, self._steps = fleet.pool, fleet.program.step_rows
         self.counts = Counter[tuple[str, str]](dict.fromkeys(self._steps.remarking, 0))
 
@@ -52,6 +53,7 @@ class FleetRepeatWatch:
     """Watch for outputs that repeat for longer than their noise allows; each is said once, of one plant."""
 
     def __init__(self, fleet: Fleet):
+        """Hold the watches of all plants' outputs, of which none was warned of yet."""
         self._watches, self._nodes = fleet.held_watches, fleet.network.nodes
         self._said = set[tuple[str, int]]()  # node and output
 

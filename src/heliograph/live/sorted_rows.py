@@ -49,6 +49,7 @@ class SortedRows:
     """
 
     def __init__(self, base: HeldRow, joint: bool, columns: list[slice], capacity: int):
+        """Hold the base as the only row; the class says what the arguments are."""
         self.held, self.keys = [base], [base.key]
         self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
 

@@ -57,6 +57,7 @@ class Pilot(Module):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, noise: "Float[ArrayLike, '']", fresh: bool = True):
+        """Check and hold the variance of a reading's error, and whether each message has a fresh gain."""
         self.noise = scalar("noise of a pilot", noise, np.finfo(float).tiny)
         self.fresh = flag("fresh", fresh)
 

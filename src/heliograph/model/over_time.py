@@ -28,7 +28,8 @@ class OverTime(Module):
     values: PyTree
 
     def __init__(self, values: object):
-        # A model's values at all steps: every array inside has the same leading axis, of steps.
+        """Hold an array, or a model whose arrays are all stacked over time, along a leading axis of one length."""
+
         self.values = jax.tree.map(_convert_leaf, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
         if len(steps) != 1 or None in steps:

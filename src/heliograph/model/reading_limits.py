@@ -93,10 +93,9 @@ class ReadingLimits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
-        # Low and high limits of each of `received` numbers; values that are codes, no readings; and from how many equal
-        # readings in a row a component is stuck (None: runs are not counted).
-        pairs = read_intervals(limits, received)
-        self.low, self.high = pairs[:, 0], pairs[:, 1]
+        """Check and hold which of `received` numbers count as missing; the class says what the arguments are."""
+        intervals = read_intervals(limits, received)
+        self.low, self.high = intervals[:, 0], intervals[:, 1]
         codes = read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
             raise fail("invalid values", "a finite number or several", show_value(invalid))

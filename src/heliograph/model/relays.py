@@ -49,11 +49,12 @@ class RelayNetwork(Module):
     relays: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, plant: AnyPlant, sensor: AnySensor, relays: Sequence[str], slots: Sequence[Slot]):
+        """Check and hold a plant, its sensor, the relays' names, and the links of each slot of the schedule."""
         self.plant, self.sensor = plant, sensor
         self.relays = names("relays", relays, len(items("relays", relays, "names")), "relay")
-        listed = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
-        parts = [{name: table(f"links to {name!r}", links, "links") for name, links in slot.items()} for slot in listed]
-        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in parts)
+        listeners = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
+        read = [{to: table(f"links to {to!r}", links, "links") for to, links in slot.items()} for slot in listeners]
+        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in read)
         _check_linear(first(plant), first(sensor))
         if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
             raise fail("relays", f"distinct names other than {SENSOR!r} and {RECEIVER!r}", list(self.relays))

@@ -213,7 +213,7 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
-        # The threshold, the rule in words, and after how many silent steps it sends (None: never).
+        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
@@ -242,8 +242,8 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
-        # The threshold, the rule in words, and after how many silent steps it sends (None: never). Both ends
-        # of the link compute the prediction that y is compared with.
+        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
+
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
@@ -275,7 +275,8 @@ class StochasticTrigger(AbstractTrigger):
         reference: Literal["zero", "prediction"] = "zero",
         losses: Literal["unknown", "known"] = "unknown",
     ):
-        # The weight of the squared error, by which it is drawn whether to send: a positive number or matrix.
+        """Check and hold the weight W, a positive number or matrix, and what y is compared with."""
+
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
@@ -320,7 +321,8 @@ class Periodic(AbstractTrigger):
     heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
-        # All of y is sent at steps `phase`, `phase` + `period`, ..., whatever its value: the reference plays no part.
+        """Check and hold period and phase; y is sent whatever its value, so that its reference plays no part."""
+
         if check_count("phase", phase, 0) >= check_count("period", period):
             raise fail("phase", f"a whole number below the period {period}", phase)
         self.period, self.phase = np.asarray(period), np.asarray(phase)

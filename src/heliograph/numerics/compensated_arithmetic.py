@@ -68,6 +68,7 @@ class _CompensatedEvaluation:
     """Evaluation of a traced program in numbers that are high + low."""
 
     def __init__(self, unit: float):
+        """Choose splitter, type and operations for numbers of the rounding `unit`, 2^-53 of doubles."""
         bits = 1 - round(np.log2(unit))  # of a number's fraction: 24 of single precision, 53 of double
         self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # times which a number is split into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64

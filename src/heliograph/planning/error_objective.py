@@ -48,6 +48,7 @@ class Error(Module):
         at_end: bool = False,
         period: int = 1,
     ):
+        """Check and hold which number is made of the covariance P, and of which steps."""
         if isinstance(weight, Mapping):
             self.weight = dict(weight)
         else:

@@ -55,6 +55,7 @@ class CountTotals:
     """
 
     def __init__(self) -> None:
+        """Begin with no counts: the sums by node, and by plant and node the counts that are in the sums."""
         self.by_node: dict[str, Counter[str]] = {}
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 

@@ -48,6 +48,7 @@ class WaitingService:
     """
 
     def __init__(self, service: BatchService, stop: asyncio.Event):
+        """Hold the service, whose last commit did not fail, and the event by which waiting ends."""
         self.service, self._stop, self._failed = service, stop, False
 
     def unpublished(self) -> list[Output]:

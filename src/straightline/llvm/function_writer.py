@@ -26,15 +26,13 @@ Scope = dict[Any, str]
 
 
 class SharedSlots:
-    """Layout of numbers that all runs share: one function computes them, the other reads them.
-
-    A number in a loop has a place for each turn.
-    """
+    """Layout of numbers that all runs share, which one function computes and the other reads; all turns of a loop's."""
 
     def __init__(self, size: int):
-        self.size = size  # bytes
-        self.places: dict[Node, int] = {}
-        self.base = ""
+        """Begin the layout at byte `size` of the memory that is shared."""
+        self.size = size  # bytes that are taken
+        self.places: dict[Node, int] = {}  # the first byte of each number
+        self.base = ""  # name of the pointer to the memory, in LLVM's text
 
     def offset_of(self, node: Node) -> int:
         """Return the offset of a shared number in bytes, assigned at its first use: 8 for each turn of its loops."""
@@ -85,12 +83,13 @@ class FunctionWriter:
     """
 
     def __init__(self, single: bool, mine: Collection[Any], products: set[Node], spread: set[Any], slots: SharedSlots):
+        """Begin the text of a function, without lines as yet; the class says what the arguments are."""
         self.single, self.mine, self.products, self.spread, self.slots = single, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
-        self.label = "entry"
-        self.count = 0
-        self.called: set[str] = set()
+        self.label = "entry"  # of LLVM's block that is being written
+        self.count = 0  # of names made so far, which are %1, %2, ...
+        self.called: set[str] = set()  # functions that must be declared
         self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}

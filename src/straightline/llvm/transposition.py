@@ -18,6 +18,7 @@ class TextLines:
     """Text with fresh names."""
 
     def __init__(self) -> None:
+        """Begin a text without lines; `count` is the number of names made so far."""
         self.lines: list[str] = []
         self.count = 0
 

@@ -160,6 +160,7 @@ class BatchDecoder:
     """
 
     def __init__(self, reader: "AnyReader", sources: Sources):
+        """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
         self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
 

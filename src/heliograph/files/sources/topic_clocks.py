@@ -41,6 +41,7 @@ class TopicClocks:
     """Clocks by topic, of messages that nothing dates but their own times."""
 
     def __init__(self) -> None:
+        """Make clocks of no topics yet; a topic gets its clock with its first message."""
         self._by_topic: dict[str, TopicClock] = {}
 
     def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:

@@ -84,6 +84,7 @@ class _ColumnCounter:
     """
 
     def __init__(self, covariances: bool):
+        """Begin before the first column."""
         self._covariances = covariances
         self.filters: dict[str, dict[str, list[Any]]] = {}
         self.count = 0
@@ -141,6 +142,7 @@ class PlantMigration:
     """
 
     def __init__(self, fleet: Fleet, mine: Identity, say: Callable[[str], None]):
+        """Hold the fleet, its network's identity, and `say`, which is called with a line for each change."""
         self.fleet, self.mine, self._say = fleet, mine, say
         self._old: dict[str, Any] = {}  # "layout" of the network that is stored, as `describe_network` writes it
 
@@ -209,11 +211,8 @@ class PlantMigration:
         Rows, events and counts of a node that is gone, or that receives another number of values now, are left out.
         """
         network, sizes_before = self.fleet.network, self._old["nodes"]  # {node: how many numbers it received}
-        kept = [
-            name
-            for name, received in sizes_before.items()
-            if name in network.nodes and network.nodes[name].received == received
-        ]
+        sizes_here = {name: node.received for name, node in network.nodes.items()}
+        kept = [name for name, received in sizes_before.items() if sizes_here.get(name) == received]
         index_here = {i: network.names.index(name) for i, name in enumerate(sizes_before) if name in kept}
         index_here[-1] = -1  # the inputs
         parts = PlantParts.from_bytes(stored, self._count_columns_before())

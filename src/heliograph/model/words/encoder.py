@@ -57,6 +57,7 @@ class Words(Module):
         dither: Dither = "none",
         resolution: "Float[ArrayLike, ''] | None" = None,
     ):
+        """Check and hold the lowest and highest word, the bits (or those that D needs) and the dither."""
         # The range of the words; of a resolution D the highest word follows.
         self.low, self.high = (np.asarray(_read_range_end(name, v)) for name, v in (("low", low), ("high", high)))
         if not np.all(self.high > self.low):

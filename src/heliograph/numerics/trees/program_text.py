@@ -39,6 +39,7 @@ class _ProgramWriter:
     """Writer of programs, each once wherever it is called."""
 
     def __init__(self) -> None:
+        """Begin before the first program."""
         self._hashes: dict[int, tuple[object, str]] = {}  # by the identity of programs, which are held
 
     def write_program(self, jaxpr: Jaxpr, consts: Sequence[Any]) -> str:

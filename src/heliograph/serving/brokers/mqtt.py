@@ -35,6 +35,13 @@ class Mqtt:
     """
 
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
+        """Connect to the broker at `address`, to read a part of the plants' messages and to write outputs.
+
+        Args:
+            address: of the broker, with the topic.
+            part: which of the equal parts of the plants is read; all plants by default.
+            translator: translates messages of the sources' topics to our own; none by default.
+        """
         self.address = address
         self._reader, self._writer = _Reader(address, part, translator), _Writer(address)
 
@@ -200,6 +207,7 @@ class _Writer(Connection):
     """Connection that publishes outputs."""
 
     def __init__(self, address: Address):
+        """Connect to the broker at `address` in a session of no name; what the broker confirms is noted from now on."""
         super().__init__(address, "")
         self._delivered: set[int] = set()  # numbers of what the broker has
         self.client.on_publish = self._note_received

@@ -203,6 +203,7 @@ class Listener:
     """
 
     def __init__(self, topics: dict[str, TopicStatistics]):
+        """Hold the statistics of each topic, which it adds to; the types of the variables are not known yet."""
         self.topics, self.kinds = topics, dict[str, str]()
 
     async def listen(self, where: Address, seconds: float) -> None:

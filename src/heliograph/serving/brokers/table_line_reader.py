@@ -37,7 +37,7 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
-        # The class says what these are. The reader of rows is chosen by the header, when it has come.
+        """Hold the network, and how its sources translate rows; a table without a path is read from standard input."""
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
@@ -98,6 +98,7 @@ class MessageRowReader:
     """Reads rows by themselves: each is a message, or several, in our own form or by the sources' map."""
 
     def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
+        """Hold `decode`, which returns the messages of one row, or texts in place of those that are refused."""
         self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:

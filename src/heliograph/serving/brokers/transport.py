@@ -97,6 +97,7 @@ class Retry:
     """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
 
     def __init__(self, what: str):
+        """Begin with the shortest wait; `what` is done again after it, in the words of a log."""
         self.what, self._wait = what, FIRST
 
     async def wait(self, error: Exception) -> None:

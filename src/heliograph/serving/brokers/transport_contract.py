@@ -54,6 +54,7 @@ class _Examination:
     """One examination of a broker, which sends numbered messages and asserts each promise of its transport."""
 
     def __init__(self, broker: Broker, messages: int, patience: float):
+        """Hold the broker, how many messages are sent, and the seconds after which a missing one is lost."""
         self.broker, self.messages, self.patience = broker, messages, patience
         self.silence = patience / 20  # seconds without a message after which we assume that there is none
         self._numbers = count()  # of the messages, each of which has another

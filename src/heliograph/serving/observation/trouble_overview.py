@@ -53,7 +53,8 @@ class TroubleOverview:
     """Keeps what is wrong with each plant, found anew where a plant has had a message since the last look."""
 
     def __init__(self) -> None:
-        self.touched = set[str]()  # since the last look
+        """Begin without plants: `touched` are those that had a message since the last look."""
+        self.touched = set[str]()
         self._wrong: dict[str, PlantTroubles] = {}
 
     def note_change(self, plant: str) -> None:

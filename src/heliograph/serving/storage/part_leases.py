@@ -36,10 +36,16 @@ class Leases:
     """
 
     def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
-        # `process`: name of this one; `parts`: number of parts of the plants; `term`: seconds of a lease.
+        """Make the tables of leases where the database has none.
+
+        Args:
+            engine: of the database.
+            process: name of this process.
+            parts: number of parts of the plants.
+            term: seconds of a lease.
+        """
         self.engine, self.process, self.parts, self.term = engine, process, parts, term
-        insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
-        self._insert = insert
+        self._insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
         TABLES.create_all(engine)
 
     def renew(self) -> set[int]:
