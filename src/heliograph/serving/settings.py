@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliograph.files.sources.json_field import Source
+from heliograph.files.sources.source_description import Source
 from heliograph.live.event import INPUTS
 from heliograph.live.fleet import Options
 from heliograph.numerics.check import TINY, check_count, fail, scalar

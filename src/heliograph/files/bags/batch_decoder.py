@@ -8,8 +8,8 @@ import numpy as np
 
 from heliograph.files.event_table import NONE, EventTable
 from heliograph.files.sources.derived_values import Computed
-from heliograph.files.sources.json_field import Source
-from heliograph.files.sources.sources import SECOND, Sources
+from heliograph.files.sources.source_description import Source
+from heliograph.files.sources.topic_reader import SECOND, TopicReader
 from heliograph.numerics.check import InputError
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class BatchDecoder:
         sources: sources of the network.
     """
 
-    def __init__(self, reader: "AnyReader", sources: Sources):
+    def __init__(self, reader: "AnyReader", sources: TopicReader):
         """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
         self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
@@ -167,7 +167,7 @@ class BatchDecoder:
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
         """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
 
-        What `Sources.read` says of a message at a time is what it gives: the same numbers, in the same order.
+        What `TopicReader.read` says of a message at a time is what it gives: the same numbers, in the same order.
         """
         try:
             readings = self._read_by_node(batch)

@@ -13,7 +13,7 @@ import numpy as np
 from heliograph.files.bags.protobuf import ProtobufSchema
 from heliograph.files.bags.ros_bag import DATA_END, FOOTER, MAGIC, BagDamagedError
 from heliograph.files.messages.message_files import FileMessage
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.files.text.text_file import CutOffError
 from heliograph.numerics.check import InputError, error_text, fail
 
@@ -64,7 +64,7 @@ def holds_messages(path: Path) -> bool:
     return bool(encodings & {JSON, PROTOBUF})
 
 
-def read_mcap_messages(path: Path, sources: Sources | None = None) -> Iterator[FileMessage | InputError]:
+def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterator[FileMessage | InputError]:
     """Yield the messages of an MCAP file in its order, each with the moment when it was logged.
 
     Messages in other encodings have no content; one that its schema does not fit is an error.
@@ -112,7 +112,7 @@ class _StoredMessage(NamedTuple):
     types: dict[int, ProtobufType]
 
 
-def _yield_stored_messages(path: Path, file: BinaryIO, sources: Sources | None) -> Iterator[_StoredMessage]:
+def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
 
     Raises:

@@ -15,7 +15,7 @@ from heliograph.files.bags.batch_decoder import BatchDecoder, RawMessage
 from heliograph.files.bags.mcap_chunks import read_messages_in_order
 from heliograph.files.event_table import EventTable
 from heliograph.files.sources.node_reading import Unread
-from heliograph.files.sources.sources import Sources
+from heliograph.files.sources.topic_reader import TopicReader
 from heliograph.numerics.check import InputError, error_text, fail
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def read_bag(
-    path: Path, sources: Sources, events: EventTable, progress: Progress | None = None, strict: bool = False
+    path: Path, sources: TopicReader, events: EventTable, progress: Progress | None = None, strict: bool = False
 ) -> None:
     """Append the events of a network in a bag to a table; only the topics of the sources are decoded.
 
@@ -99,7 +99,7 @@ def read_bag(
     _note_unmatched_topics(path, sources, counts, events)
 
 
-def _note_unmatched_topics(path: Path, sources: Sources, counts: Counter[str], events: EventTable) -> None:
+def _note_unmatched_topics(path: Path, sources: TopicReader, counts: Counter[str], events: EventTable) -> None:
     """Add notes to the events on topics of the bag that no source has, and on sources whose topics it has not.
 
     `counts`: messages of the bag by topic. Topics of sources with a wildcard, + or #, are never said to be missing.
@@ -209,7 +209,7 @@ def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessa
 def _append_messages(
     path: Path,
     reader: "AnyReader",
-    sources: Sources,
+    sources: TopicReader,
     batch: list[RawMessage],
     done: int,
     table: EventTable,
@@ -265,7 +265,7 @@ def format_moment(nanoseconds: int) -> str:
     return f"{np.datetime64(nanoseconds, 'ns')}Z"
 
 
-def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: Sources) -> None:
+def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
     """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
         fields = dict(list_fields(reader, connection.msgtype))

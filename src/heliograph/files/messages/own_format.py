@@ -62,7 +62,7 @@ class OwnMessageCollector:
 
         Counted are messages used and refused; `reasons`: of the first refused; `broken`: where the file was cut off.
         """
-        self.source, self._reader = source, OwnMessageReader(network, str(source), ignore_unknown, table)
+        self.source, self._reader = source, HeliographMessageReader(network, str(source), ignore_unknown, table)
         self._table: EventTable | None = None
         self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
 
@@ -116,7 +116,7 @@ class OwnMessageCollector:
             self._table.add(reading, arrival)
 
 
-class OwnMessageReader:
+class HeliographMessageReader:
     """Reader of messages in our own form.
 
     Fields: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (optional: at once), `plant` (optional), and the

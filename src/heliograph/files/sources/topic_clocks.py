@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.files.sources.json_field import Source
 from heliograph.files.sources.message_fields import field_at
+from heliograph.files.sources.source_description import Source
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.times.dates import looks_like_date
 from heliograph.numerics.times.timestamp_order import YEAR

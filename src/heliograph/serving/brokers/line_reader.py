@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from heliograph.files.messages.message_files import FileMessage, parse_message_document, parse_message_line
-from heliograph.files.messages.own_format import OwnMessageReader, is_own_message
+from heliograph.files.messages.own_format import HeliographMessageReader, is_own_message
 from heliograph.model.plant import TIME_STEP
 from heliograph.numerics.check import InputError, file_path, flag, instance
 from heliograph.serving.brokers.arrival_order import ArrivalOrder
@@ -63,7 +63,7 @@ class LineReader:
         # our own form; a table.
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
-        self._own = OwnMessageReader(network, self.source, ignore_unknown, table=False)
+        self._own = HeliographMessageReader(network, self.source, ignore_unknown, table=False)
         self._table = TableLineReader(network, translator, path, ignore_unknown)
         self._is_table: bool | None = None  # known once a message or the names of columns came
         self._document: list[bytes] | None = None  # lines of a document that has not ended

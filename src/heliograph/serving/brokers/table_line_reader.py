@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.files.csv_columns import CsvColumnReader
 from heliograph.files.messages.message_files import PAYLOAD, TOPIC, convert_cells, make_message_of_row
-from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, OwnMessageReader
+from heliograph.files.messages.own_format import NODE, OWN, SEQUENCE, HeliographMessageReader
 from heliograph.files.recording import RowReader
 from heliograph.files.recording_rows import RecordingRows, join_recording_rows
 from heliograph.files.sources.node_reading import Reading, Unread
@@ -41,7 +41,7 @@ class TableLineReader:
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
-        self._reader: MessageRowReader | TimeRowReader | None = None
+        self._reader: IndependentRowReader | TimeRowReader | None = None
 
     def names_columns(self, line: str) -> bool:
         """Return whether a line is the first of a table: it names a column that the network or its sources know."""
@@ -76,25 +76,25 @@ class TableLineReader:
             self._reader = self._choose_reader(self._text.header)
         return [] if self._reader is None or not rows else self._reader.read(rows)
 
-    def _choose_reader(self, header: list[str]) -> "MessageRowReader | TimeRowReader":
+    def _choose_reader(self, header: list[str]) -> "IndependentRowReader | TimeRowReader":
         """Return the reader of rows with these columns: events in our own form, rows that sources map, rows of time.
 
         A row of time has the measurements of all nodes; an event is one node's, with its name and count.
         """
         if {NODE, SEQUENCE} <= set(header):
-            own = OwnMessageReader(self._network, self._source, self._ignore, table=True)
-            return MessageRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
+            own = HeliographMessageReader(self._network, self._source, self._ignore, table=True)
+            return IndependentRowReader(lambda row: read_own_event(own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
             topic = translator.topic_of_rows(self._path, header)
             if topic is not None or TOPIC in header:
-                return MessageRowReader(
+                return IndependentRowReader(
                     lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
                 )
         return TimeRowReader(self._network, header, self._text, self._ignore)
 
 
-class MessageRowReader:
+class IndependentRowReader:
     """Reads rows by themselves: each is a message, or several, in our own form or by the sources' map."""
 
     def __init__(self, decode: Callable[[CsvRow], Sequence[Payload]]):
@@ -190,7 +190,7 @@ class TimeRowReader:
         return np.asarray((time - self._origin) / SECOND)
 
 
-def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
+def read_own_event(reader: HeliographMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in our own form: its measurement, and its inputs if it has any.
 
     Or why one cannot be read: as a text, or with its count and time where these are known.
@@ -208,7 +208,7 @@ def read_own_event(reader: OwnMessageReader, where: str, content: dict[str, obje
     return payloads
 
 
-def _make_message(reader: OwnMessageReader, reading: Reading, arrival: float) -> Message:
+def _make_message(reader: HeliographMessageReader, reading: Reading, arrival: float) -> Message:
     """Return the message of an event; it has no arrival where that is the time of the measurement."""
     assert reading.time is not None
     time = reading.time if reader.numbers else convert_nanoseconds_to_date(int(reading.time))

@@ -1,4 +1,4 @@
-"""Sources of data, read by a network: messages of topics to measurements of nodes and inputs of the plant."""
+"""Messages of topics, read by the sources of a network: measurements of nodes, and inputs of the plant."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -9,7 +9,6 @@ import numpy as np
 
 from heliograph.files.device_availability import DeviceStatuses
 from heliograph.files.sources.derived_values import Computed, ZeroIfAbsent
-from heliograph.files.sources.json_field import Field, Source
 from heliograph.files.sources.message_fields import (
     MissingFieldError,
     convert_count,
@@ -19,6 +18,7 @@ from heliograph.files.sources.message_fields import (
 )
 from heliograph.files.sources.mixed_sender_detection import SenderCounter
 from heliograph.files.sources.node_reading import Reading, Unread
+from heliograph.files.sources.source_description import Field, Source
 from heliograph.files.sources.topic_clocks import TopicClocks
 from heliograph.live.event import INPUTS
 from heliograph.model.checks.refusal_reasons import RefusedError
@@ -42,8 +42,8 @@ class MappedSource(NamedTuple):
     places: dict[str, np.ndarray]
 
 
-class Sources:
-    """Sources checked against a network: messages of a topic to readings; unknown topics are counted, never guessed.
+class TopicReader:
+    """Reads messages of topics by the sources of a network, as readings of nodes; unknown topics are counted.
 
     Args:
         table: sources by topic, as in a network's file.
