@@ -135,9 +135,10 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(loop.body), self.values, self.memory
 
         def begin_turn(carry: PyTree, counter: Any) -> None:
-            """Set values and memory as a turn begins: those from outside, and the carry (numbers, arrays).
+            """Set `self.values` and `self.memory` as a turn begins: those from outside the loop, and the carry.
 
-            `carried` are the places of the loop's numbers, `filled` the buffers that it fills.
+            The carry is a pair: the numbers of the parameters whose places are `carried`, and the arrays of the
+            buffers `filled`, which the loop fills.
             """
             numbers, arrays = carry
             self.values, self.memory = dict(outer_values), outer_memory | dict(zip(filled, arrays, strict=True))
@@ -146,7 +147,7 @@ class _JaxEvaluation:
                 self.values[loop.counter] = jnp.asarray(counter, np.int64)
 
         def run_turn(counter: Any, carry: PyTree) -> PyTree:
-            """Return the carry after the body: the numbers `carried`, and the memory of the buffers `filled`."""
+            """Return the carry after a turn: the `carried` numbers for the next, and what the buffers `filled` hold."""
             begin_turn(carry, counter)
             self.evaluate_block(loop.body.items)
             return [self.value(loop.following[k]) for k in carried], [self.memory[b] for b in filled]
@@ -174,7 +175,11 @@ class _JaxEvaluation:
         filled, outer_values, outer_memory = self._find_filled(guard.body), self.values, self.memory
 
         def evaluate_body() -> PyTree:
-            """Return the guarded block's values that are `used`, and the memory of the buffers that it fills."""
+            """Return the guarded block's values that are used outside it, and what the buffers that it fills hold.
+
+            `used` are the places of the former in `guard.values`, `filled` are the latter. `self.values` and
+            `self.memory` begin as they are outside of the block.
+            """
             self.values, self.memory = dict(outer_values), dict(outer_memory)
             self.evaluate_block(guard.body.items)
             return [self.value(guard.values[k]) for k in used], [self.memory[b] for b in filled]

@@ -75,22 +75,18 @@ class SummingProgram:
             runs: how many.
             first: number of the first one; 0 by default.
         """
+        bound, end = self.bind_arguments(jax.tree.leaves(arguments), runs), first + runs
         # A part is some whole vectors of runs: a PARTS-th of all vectors, rounded up.
-        begun = self.bind_arguments(jax.tree.leaves(arguments), runs)
         part_length = -(-runs // (PARTS * self.width)) * self.width
-        starts = range(first, first + runs, part_length)
-        sums = [begun.make_zero_sums() for _ in starts]
-
-        def compute_part(part: int) -> list[np.ndarray | None]:
-            """Add the runs of a part to its sums; return its results that are collected, None for all others."""
-            return begun.add_runs(np.arange(starts[part], min(starts[part] + part_length, first + runs)), sums[part])
-
-        collected = list(get_thread_pool().map(compute_part, range(len(starts))))
-        return jax.tree.unflatten(self.tree, self._join_results_of_parts(begun, sums, collected, first, runs))
+        starts = range(first, end, part_length)
+        numbers_of_runs = [np.arange(start, min(start + part_length, end)) for start in starts]
+        sums = [bound.make_zero_sums() for _ in starts]
+        collected = list(get_thread_pool().map(bound.add_runs, numbers_of_runs, sums))
+        return jax.tree.unflatten(self.tree, self._join_results_of_parts(bound, sums, collected, first, runs))
 
     def _join_results_of_parts(
         self,
-        begun: "SummingProgramWithArguments",
+        bound: "SummingProgramWithArguments",
         sums: Sequence[Sequence[np.ndarray]],
         collected: Sequence[Sequence[np.ndarray | None]],
         first: int,
@@ -101,12 +97,10 @@ class SummingProgram:
         A summed result is the sum over all parts; one that is collected has the parts one behind another; one that all
         runs share is repeated for each run, or counts once for each run of a batch.
         """
-        totals, runs_by_batch = (
-            iter(begun.add_partial_sums(sums)),
-            _count_runs_by_batch(first, runs, self.summed.batches),
-        )
+        totals = iter(bound.add_partial_sums(sums))
+        runs_by_batch = _count_runs_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
-        for shared, is_summed, *parts in zip(begun.shared, self.summed.outputs, *collected, strict=True):
+        for shared, is_summed, *parts in zip(bound.shared, self.summed.outputs, *collected, strict=True):
             if shared is None:
                 leaves.append(next(totals) if is_summed else np.concatenate(parts))
             elif is_summed:

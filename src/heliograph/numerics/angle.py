@@ -69,9 +69,10 @@ def continue_angles(
     """
     if not angles:
         return function
-    start, size = function(center), center.shape[0]
-    turns = jnp.zeros((*start.shape, size))
+    value_at_center, size = function(center), center.shape[0]
+    D = jnp.zeros((*value_at_center.shape, size))
     for i in given:
-        slope = jax.jvp(function, (center,), (jnp.zeros_like(center).at[i].set(1.0),))[1]
-        turns = turns.at[:, i].set(jnp.round(slope))
-    return lambda x: wrap_near(function(x), start + turns @ (x - center), angles)
+        direction = jnp.zeros_like(center).at[i].set(1.0)
+        slope = jax.jvp(function, (center,), (direction,))[1]
+        D = D.at[:, i].set(jnp.round(slope))
+    return lambda x: wrap_near(function(x), value_at_center + D @ (x - center), angles)

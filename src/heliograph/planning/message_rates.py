@@ -272,30 +272,34 @@ def _compute_rate_on_grid(system: _ScalarSystem, delta: float, share: float) -> 
     """
     a, q, r = system.a, system.q, system.r
     cells = _choose_cells(system, delta, share)
-    # Probabilities of a cell given the middle of another: move[new, old] of x after a step, noise[x, z] of z given x.
+    # Probabilities of a cell given the middle of another: T[new, old] of x after a step, noise[x, z] of z given x.
     x = np.arange(-cells.each_side, cells.each_side + 1) * cells.length
-    move, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
-    # quiet[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
-    quiet = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
+    T, noise = _compute_cell_probabilities(x, a * x, np.sqrt(q)).T, _compute_cell_probabilities(x, x, np.sqrt(r))
+    # silence[i, j] = P(no message) of x in cell i, with the value of cell j sent last.
+    silence = ndtr((x + delta - x[:, None]) / np.sqrt(r)) - ndtr((x - delta - x[:, None]) / np.sqrt(r))
     size = len(x)
 
-    def move_and_send(vector: np.ndarray) -> np.ndarray:
-        """Return the law after a step, from that before it, each (size^2,): x moves, then is sent or not."""
-        f = move @ vector.reshape(size, size)
-        return np.asarray(f * quiet + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
+    def step_law(vector: np.ndarray) -> np.ndarray:
+        """Return the law (size^2,) of (x, value sent last) after a step: x moves by T, then is sent or not.
+
+        Without a message (probability `silence`) the value sent last stays; with one it is what was measured, x + v,
+        whose probabilities given x are `noise`.
+        """
+        f = T @ vector.reshape(size, size)
+        return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()
 
     # The stationary law is the eigenvector of a step for its largest eigenvalue, 1: power iterations (Arnoldi) from the
     # law of the state and a value that was just sent.
     deviation = np.sqrt(q / (1 - a * a))
     start = _compute_cell_probabilities(x, np.zeros(1), deviation).T * noise
-    operator = LinearOperator((size**2, size**2), matvec=move_and_send, dtype=np.float64)
+    operator = LinearOperator((size**2, size**2), matvec=step_law, dtype=np.float64)
     most_iterations = int(PRODUCTS / size**3 / PRODUCTS_OF_ITERATION) + 2
     try:
         _, vectors = eigs(operator, 1, v0=start.ravel(), maxiter=most_iterations, tol=1e-9)
     except ArpackError as why:
         raise fail("delta", "one whose rate of messages converges within seconds", f"{delta:g}") from why
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(size, size)
-    return float(_compute_law_after_message(move @ f, noise, cells.of_delta).sum()), cells.length
+    return float(_compute_law_after_message(T @ f, noise, cells.of_delta).sum()), cells.length
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:

@@ -244,6 +244,10 @@ class ScaledProgramme:
         """
 
         def lagrangian_gradient(point: Vector) -> Vector:
+            """Return the gradient of value - m' room by the variables `index`, in units of `scale`.
+
+            m are the `multipliers` of the `active` limits.
+            """
             gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
             return np.asarray((gradient - multipliers @ slopes)[index] * scale)
 

@@ -347,7 +347,11 @@ async def _serve_shared(settings: ServiceSettings, program: NetworkProgram, wrap
     checked.close()
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        """Serve the part with this number until `stop` is set."""
+        """Serve one part of the plants, that of this number among `parts`, until `stop` is set.
+
+        As all parts: with the settings of the service, the network's `program`, `wrap`, which shows it on the page, and
+        the store that was `checked` before.
+        """
         await _serve_part(settings, program, wrap, Part(number, parts), stop, checked)
 
     # Lease parts under a name that is unique to this process.

@@ -82,23 +82,21 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
         i: index of the share.
         side: -1 or 1.
     """
-    others = np.delete(np.arange(len(top)), i)
-    nearby = top[others]  # the other logits at the last point above the level: the next search begins there
+    others = np.delete(np.arange(len(top)), i)  # indices of the other logits
+    start_of_others = top[others]  # the other logits at the last point above the level: the next search begins there
 
     @cache  # from another start a search may end elsewhere, so that an end of a bracket has to keep its value
-    def height_above_level(logit_of_share: float) -> float:
-        """Return how far the profile at this logit is above the level.
+    def height_above_level(logit: float) -> float:
+        """Return how far the profile is above `level`: the log-likelihood, largest over the other logits, at this one.
 
-        `function`: log-likelihood of all logits. i: the logit that is held; `others`: the rest, over which it
-        is maximised; `nearby`: their values at the last height above the level, from which the next search
-        begins.
+        `function` is the log-likelihood of all logits, of which number i is held at `logit`. The search over the
+        others begins at `start_of_others`, which are kept from the last point above the level.
         """
-        nonlocal nearby
-        best_others, profile = maximise_over_shares(
-            _fix_logit(function, i, logit_of_share, others), [nearby], PROFILE_ACCURACY
-        )
+        nonlocal start_of_others
+        function_of_others = _fix_logit(function, i, logit, others)
+        best_others, profile = maximise_over_shares(function_of_others, [start_of_others], PROFILE_ACCURACY)
         if profile > level:
-            nearby = best_others
+            start_of_others = best_others
         return profile - level
 
     # The maximum itself, if it is below by rounding; an end of the domain, if the profile is above the level there.

@@ -184,26 +184,29 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
     return LinearPlant(matrix, noise, center, start, input_matrix, states, plant.inputs, circular, limits)
 
 
-def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, coupling: np.ndarray, pick: Any) -> tuple[Any, Any]:
-    """Return [[A, E], [0, F]] and [B; B_b], functions of the inputs where some part is one; `pick` takes those of b."""
-    below = np.zeros((len(bias.states), len(plant.states)))
+def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, inputs_of_bias: Any) -> tuple[Any, Any]:
+    """Return [[A, E], [0, F]] and [B; B_b], as functions of the inputs u where some block is a function of them.
+
+    E is the coupling, by which biases drive the plant; `inputs_of_bias` @ u are those of u that move the biases.
+    """
+    zeros = np.zeros((len(bias.states), len(plant.states)))
     if not any(isinstance(value, MatrixOfInputs) for model in (plant, bias) for value in vars(model).values()):
-        xp = library(plant.matrix, coupling, bias.matrix, plant.input_matrix, bias.input_matrix)
-        matrix = xp.block([[plant.matrix, coupling], [below, bias.matrix]])
-        return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ pick])
+        xp = library(plant.matrix, E, bias.matrix, plant.input_matrix, bias.input_matrix)
+        matrix = xp.block([[plant.matrix, E], [zeros, bias.matrix]])
+        return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ inputs_of_bias])
 
-    def move(u: jax.Array) -> jax.Array:
-        """Return [[A, E], [0, F]] under the inputs u."""
-        of_bias = bias.transition_matrix(pick @ u)
-        return jnp.block([[plant.transition_matrix(u), jnp.asarray(coupling)], [jnp.asarray(below), of_bias]])
+    def transition_matrix(u: jax.Array) -> jax.Array:
+        """Return [[A, E], [0, F]] under the inputs u: of the plant, of the coupling E, and of the bias."""
+        A, F = plant.transition_matrix(u), bias.transition_matrix(inputs_of_bias @ u)
+        return jnp.block([[A, jnp.asarray(E)], [jnp.asarray(zeros), F]])
 
-    def drive(u: jax.Array) -> jax.Array:
-        """Return [B; B_b] under the inputs u: of the plant, and of the biases, whose inputs `pick` takes out of u."""
-        return jnp.concatenate(
-            [matrix_under_inputs(plant.input_matrix, u), matrix_under_inputs(bias.input_matrix, pick @ u) @ pick]
-        )
+    def input_matrix(u: jax.Array) -> jax.Array:
+        """Return [B; B_b] under the inputs u: of the plant, and of the bias, which `inputs_of_bias` @ u moves."""
+        B = matrix_under_inputs(plant.input_matrix, u)
+        of_bias = matrix_under_inputs(bias.input_matrix, inputs_of_bias @ u)
+        return jnp.concatenate([B, of_bias @ inputs_of_bias])
 
-    return move, drive
+    return transition_matrix, input_matrix
 
 
 class BiasedMeasurement(Module):

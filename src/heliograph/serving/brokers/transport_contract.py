@@ -131,8 +131,8 @@ class _Examination:
         """Receive until all of these bodies have arrived; return each once, in the order of first arrival."""
         received = list[bytes]()
 
-        async def listen() -> None:
-            """Receive batches until all of the bodies have arrived, and add what came to `received`."""
+        async def receive_all() -> None:
+            """Receive batches of the transport, acknowledged if `acknowledge`, until `received` has all `bodies`."""
             while set(bodies) - set(received):
                 received.extend(await self._unpack(await transport.receive(), acknowledge))
                 await asyncio.sleep(0)  # a transport that never waits would let no time pass
@@ -140,7 +140,7 @@ class _Examination:
         # A timeout, and not `wait_for`: Python 3.11's may lose the cancellation of what waits inside, and never end.
         try:
             async with asyncio.timeout(self.patience):
-                await listen()
+                await receive_all()
         except TimeoutError:
             missing, total = len(set(bodies) - set(received)), len(bodies)
             what = f"receive: expected {total} messages within {self.patience:g} s, {missing} did not come"
