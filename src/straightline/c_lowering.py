@@ -42,17 +42,18 @@ class ZeroFoldingGraph(Graph):
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """Return a node (scalar operation), 0 for a product of zero and a number that is finite whatever the data.
 
-        PRESERVING operations, and selections, of finite numbers are finite: so notes `finite` what follows from those.
+        The node is noted as finite (`self.finite`) if its arguments are and its operation is one of PRESERVING, whose
+        results are finite then, or a selection.
         """
         if op == "mul" and type in REAL:
             for a, b in (args, args[::-1]):
                 if a.op == "constant" and a.value == 0 and self._is_finite(b):
                     return self.constant(0.0, type)
-        made = super().node(op, type, *args, value=value)
-        numbers = args[1:] if op == "select" else args  # a selection is of its numbers, whatever its condition is
+        node = super().node(op, type, *args, value=value)
+        numbers = args[1:] if op == "select" else args  # of a selection the condition does not count
         if type in REAL and (op in PRESERVING or op == "select") and all(map(self._is_finite, numbers)):
-            self.finite.add(made)
-        return made
+            self.finite.add(node)
+        return node
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
         """Return the node of buffer[offset + sum strides * indices]; note it as finite if all of its buffer are."""

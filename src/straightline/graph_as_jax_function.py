@@ -63,16 +63,17 @@ class _JaxEvaluation:
     def _gather_result(self, value: Any) -> jax.Array:
         """Return an array of the result: its nodes' values stacked, or read from memory.
 
-        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + moves: steps times nodes' values.
+        There, entry (i, j, ...) lies at start + offset + strides * (i, j, ...) + the sum of the moves, each a stride
+        times the value of a node.
         """
         if not isinstance(value, StridedArray):
-            nodes = [self.value(n) for n in value.ravel().tolist()]
-            return jnp.stack(nodes).reshape(value.shape) if nodes else jnp.zeros(value.shape)
+            numbers = [self.value(n) for n in value.ravel().tolist()]
+            return jnp.stack(numbers).reshape(value.shape) if numbers else jnp.zeros(value.shape)
         owner, start = value.buffer.owner
-        grid = np.indices(value.shape).reshape(value.ndim, -1)
-        places = np.array(value.strides, int) @ grid + start + value.offset
-        moved = sum((s * self.value(i) for s, i in value.moves), jnp.asarray(places))
-        return self.memory[owner][moved].reshape(value.shape)
+        indices = np.indices(value.shape).reshape(value.ndim, -1)
+        known_places = np.array(value.strides, int) @ indices + start + value.offset
+        places = sum((stride * self.value(node) for stride, node in value.moves), jnp.asarray(known_places))
+        return self.memory[owner][places].reshape(value.shape)
 
     def value(self, node: Node) -> jax.Array:
         """Return the value of a node."""

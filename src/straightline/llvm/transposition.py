@@ -132,15 +132,16 @@ def _write_address(bits: int, start: str, number: int) -> str:
 def _write_choice(text: TextLines, registers: list[str], places: list[tuple[int, int]], vector: str) -> str:
     """Write the choice of numbers out of registers; return the name of the register that has them, lane by lane.
 
-    By one shuffle for each register: of what was chosen so far and its own numbers, which a mask counts from `side` on.
+    Each lane keeps what was chosen for it so far, or takes its number from the next register: by one shuffle of the
+    two for each register, whose mask counts the second one's numbers from `side` on.
 
-    places: for each lane the number of the register that has its number, and the place there.
+    places: for each lane which register has its number, and in which lane there.
     """
-    chosen, side = "poison", len(places)
-    for number in sorted({register for register, _ in places}):
-        order = [side + place if register == number else lane for lane, (register, place) in enumerate(places)]
+    chosen, side = "poison", len(places)  # a register of which no number is set
+    for second in sorted({register for register, _ in places}):
+        order = [side + place if register == second else lane for lane, (register, place) in enumerate(places)]
         mask = ", ".join(f"i32 {place}" for place in order)
-        pair = f"{vector} {chosen}, {vector} {registers[number]}"
+        pair = f"{vector} {chosen}, {vector} {registers[second]}"
         chosen = text.add(f"shufflevector {pair}, <{side} x i32> <{mask}>")
     return chosen
 

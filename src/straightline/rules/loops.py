@@ -104,15 +104,15 @@ def _store_row(
 
     The row's number is that of the turn, `counter`, or, `backwards`, counted from the last row back.
     """
-    flat = _list_nodes_of_numbers(value)
-    type: Type = flat[0].type if flat else "f64"
+    nodes = _list_nodes_of_numbers(value)
+    type: Type = nodes[0].type if nodes else "f64"
     buffer = Buffer("scratch", type, (length, *value.shape), outer)
     # The first place of each node in a row, if some nodes have several: noted from the end on, so that the first stays.
-    size, first_places = len(flat), {node: place for place, node in reversed(list(enumerate(flat)))}
-    buffer.first = [first_places[node] for node in flat] if len(first_places) < size else []
-    start, stride = ((length - 1) * size, -size) if backwards else (0, size)
-    for entry, node in enumerate(flat):
-        lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
+    size, first_places = len(nodes), {node: place for place, node in reversed(list(enumerate(nodes)))}
+    buffer.first = [first_places[node] for node in nodes] if len(first_places) < size else []
+    first_row, stride = ((length - 1) * size, -size) if backwards else (0, size)
+    for place, node in enumerate(nodes):
+        lowering.graph.store(buffer, node, offset=first_row + place, strides=(stride,), indices=(counter,))
     return StridedArray.of_whole_buffer(buffer)
 
 
@@ -266,11 +266,15 @@ def fill_carried_memory(lowering: Lowering, filled: Sequence[tuple[CarriedMemory
 
     An array that lies in carried memory itself, as where two are exchanged, is copied first.
     """
-    memory = {carried.memory for carried, _ in filled}
-    arrays = [(carried, put_in_memory(lowering, x)) for carried, x in filled]
-    arrays = [(carried, copy_in_memory(lowering, x) if x.buffer.owner[0] in memory else x) for carried, x in arrays]
-    for carried, x in arrays:
-        carried.fill(lowering, x)
+    carried_memory = {target.memory for target, _ in filled}
+    pairs = []
+    for target, value in filled:
+        array = put_in_memory(lowering, value)
+        is_carried = array.buffer.owner[0] in carried_memory
+        pairs.append((target, array, is_carried))
+    arrays = [copy_in_memory(lowering, array) if is_carried else array for _, array, is_carried in pairs]
+    for (target, _, _), array in zip(pairs, arrays, strict=True):
+        target.fill(lowering, array)
 
 
 def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
