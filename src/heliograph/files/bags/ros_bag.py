@@ -250,12 +250,12 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """
     from rosbags.interfaces import Nodetype
 
-    _, fields = reader.typestore.fielddefs.get(kind, ([], []))
-    for name, (node, of) in fields if depth else ():
+    _constants, fields = reader.typestore.fielddefs.get(kind, ([], []))
+    for name, (node, field_type) in fields if depth else ():
         if node == Nodetype.BASE:
-            yield prefix + name, str(of[0])
-        elif node == Nodetype.NAME:
-            yield from list_fields(reader, str(of), f"{prefix}{name}.", depth - 1)
+            yield prefix + name, str(field_type[0])
+        elif node == Nodetype.NAME:  # a message within this one
+            yield from list_fields(reader, str(field_type), f"{prefix}{name}.", depth - 1)
         else:
             yield prefix + name, "list"
 
@@ -268,18 +268,14 @@ def format_moment(nanoseconds: int) -> str:
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
     """Raise ValueError, before anything is read, at a mapped field that the type of its topic does not have."""
     for connection in reader.connections:
-        fields = dict(list_fields(reader, connection.msgtype))
-        needed = [path_ for source, *_ in sources.of(connection.topic) for path_ in source.fields if path_]
+        what, fields = f"{path}, {connection.topic}", dict(list_fields(reader, connection.msgtype))
+        needed = [field for source, *_ in sources.of(connection.topic) for field in source.fields if field]
         if needed and not fields:
-            what = f"{path}, {connection.topic}"
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
-        for path_ in needed:
-            if not _has_field(fields, path_):
-                raise fail(
-                    f"{path}, {connection.topic}",
-                    f"a field {path_!r} in {connection.msgtype}",
-                    f"only {_join_names(list(fields), 24)}",
-                )
+        for field in needed:
+            if not _has_field(fields, field):
+                expected = f"a field {field!r} in {connection.msgtype}"
+                raise fail(what, expected, f"only {_join_names(list(fields), 24)}")
 
 
 def _has_field(fields: dict[str, str], path: str) -> bool:
@@ -288,9 +284,8 @@ def _has_field(fields: dict[str, str], path: str) -> bool:
     `fields`: type of each field by its path; that of a list is "list", and what is in it is not looked up.
     """
     lists = [name for name, kind in fields.items() if kind == "list"]
-    return any(name == path or name.startswith(f"{path}.") for name in fields) or any(
-        path.startswith(f"{name}.") for name in lists
-    )
+    is_field_or_message = any(name == path or name.startswith(f"{path}.") for name in fields)
+    return is_field_or_message or any(path.startswith(f"{name}.") for name in lists)
 
 
 def _format_reason(error: Exception) -> str:
@@ -343,13 +338,13 @@ def make_copy_of_whole_records(path: Path) -> Iterator[tuple[Path, int]]:
 
     ENDING is what every whole file ends with, which a file that was cut off lacks; BLOCK bytes are copied at a time.
     """
-    end = find_end_of_whole_records(path)
+    size = find_end_of_whole_records(path)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        with path.open("rb") as file, copy.open("wb") as whole:
-            left = end
-            while left and (block := file.read(min(BLOCK, left))):
-                whole.write(block)
-                left -= len(block)
-            whole.write(ENDING)
-        yield copy, end
+        with path.open("rb") as source, copy.open("wb") as target:
+            to_copy = size
+            while to_copy and (block := source.read(min(BLOCK, to_copy))):
+                target.write(block)
+                to_copy -= len(block)
+            target.write(ENDING)
+        yield copy, size

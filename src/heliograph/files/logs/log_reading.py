@@ -96,8 +96,9 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
     yield from log.messages
     notes += log.notes
     if path.is_dir():
-        rest = [part.name for part in sorted(path.iterdir()) if part not in list_logs(path) and part != given.dbc]
-        notes += [f"{path}: not read beside logs: {', '.join(rest[:LISTED])}"] if rest else []
+        used_files = (*list_logs(path), given.dbc)
+        other_files = [file.name for file in sorted(path.iterdir()) if file not in used_files]
+        notes += [f"{path}: not read beside logs: {', '.join(other_files[:LISTED])}"] if other_files else []
     if used:
         notes.append(f"{place}: in the file's units, before scale= and offset=: {', '.join(used)}")
 

@@ -64,12 +64,16 @@ def describe_unused_files(folder: Path, sources: TopicReader) -> list[str]:
 
     A topic with a wildcard, + or #, is never said to be missing.
     """
-    used = list_used_files(folder, sources)
-    rest = [path.name for path in list_message_files(folder) if path not in used]
-    found = {find_topic_of_file(path, sources) for path in used}
-    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
-    lines = [f"{folder}: not among the sources: {_join_names(rest)}"] if rest else []
-    return [*lines, f"{folder}: not in the folder: {_join_names(missing)}"] if missing else lines
+    used_files = list_used_files(folder, sources)
+    unused = [path.name for path in list_message_files(folder) if path not in used_files]
+    used_topics = {find_topic_of_file(path, sources) for path in used_files}
+    missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in used_topics]
+    lines = []
+    if unused:
+        lines.append(f"{folder}: not among the sources: {_join_names(unused)}")
+    if missing:
+        lines.append(f"{folder}: not in the folder: {_join_names(missing)}")
+    return lines
 
 
 def _join_names(names: list[str]) -> str:

@@ -127,13 +127,13 @@ def read_events(
 def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, strict: bool) -> EventTable:
     """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
     events = EventTable(sources.network, sources.step_seconds)
-    for part in parts_of(path) or [path]:
-        if holds_messages(part):
-            found = _append_messages_by_topic(part, read_mcap_messages(part, sources), sources, events, strict)
-            missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in found]
-            events.notes += [f"{part}: not in the bag: {', '.join(missing)}"] if missing else []
+    for bag in parts_of(path) or [path]:
+        if holds_messages(bag):
+            topics = _append_messages_by_topic(bag, read_mcap_messages(bag, sources), sources, events, strict)
+            missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in topics]
+            events.notes += [f"{bag}: not in the bag: {', '.join(missing)}"] if missing else []
         else:
-            read_bag(part, sources, events, progress, strict)
+            read_bag(bag, sources, events, progress, strict)
     return events
 
 
@@ -170,10 +170,10 @@ def _read_table_of_own_format(
     path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
 ) -> EventTable:
     """Return the events of a table in our own form, with the columns node, sequence, time and values."""
-    own = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
+    collector = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _yield_messages(path):
-        own.add(message, strict)
-    return own.events()
+        collector.add(message, strict)
+    return collector.events()
 
 
 def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicReader | None, strict: bool) -> EventTable:

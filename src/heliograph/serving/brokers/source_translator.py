@@ -264,14 +264,14 @@ class Translator:
         A copy of a message, which has the same values and may come where `repeatable`, gets the number of the message.
         """
         assert reading.time is not None
-        values = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
-        mine = reading.values.tobytes()
-        if repeatable and mine in values:  # a copy
-            return values.index(mine)
-        values.append(mine)
+        values_so_far = self._uncounted.setdefault((reading.plant, reading.node, reading.time), [])
+        values = reading.values.tobytes()
+        if repeatable and values in values_so_far:  # a copy
+            return values_so_far.index(values)
+        values_so_far.append(values)
         if len(self._uncounted) > REMEMBERED:  # forget the oldest time
             self._uncounted.popitem(last=False)
-        return len(values) - 1
+        return len(values_so_far) - 1
 
 
 def convert_nanoseconds_to_date(nanoseconds: int) -> datetime:

@@ -102,10 +102,11 @@ class IndependentRowReader:
         self._decode = decode
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows (`_decode`), and texts why others cannot be read, in order."""
-        return [
-            payload for row in rows for payload in ([str(row)] if isinstance(row, InputError) else self._decode(row))
-        ]
+        """Return the messages of all rows in order, and in the place of a row that cannot be read a text why."""
+        payloads = list[Payload]()
+        for row in rows:
+            payloads += [str(row)] if isinstance(row, InputError) else self._decode(row)
+        return payloads
 
 
 class TimeRowReader:
@@ -164,14 +165,14 @@ class TimeRowReader:
     def end(self) -> list[Payload]:
         """Return the messages of the rows of a file, now that all have come, and why others have none.
 
-        Messages are lines of JSON. Doubts about the rows (warnings) are logged.
+        Messages are lines of JSON. Warnings about the rows are logged.
         """
         if not self._cells:
             return []
-        with warnings.catch_warnings(record=True) as doubts:
+        with warnings.catch_warnings(record=True) as caught_warnings:
             warnings.simplefilter("always", UserWarning)
             recording, self._cells = self._rows.arrange_recording(join_recording_rows(self._cells)), []
-        for line in [*self._rows.notes, *(str(doubt.message) for doubt in doubts)]:
+        for line in [*self._rows.notes, *(str(warning.message) for warning in caught_warnings)]:
             LOG.warning("%s", line)
         events, origin = events_of_recording(recording, self._network)
         lines = [json.dumps(encode_event(event, "", origin)).encode() for event in events]
@@ -196,11 +197,11 @@ def read_own_event(reader: HeliographMessageReader, where: str, content: dict[st
     Or why one cannot be read: as a text, or with its count and time where these are known.
     """
     try:
-        found = reader.read(where, content)
+        readings_and_arrivals = reader.read(where, content)
     except InputError as error:
         return [str(error)]
     payloads = list[Payload]()
-    for reading, arrival in found:
+    for reading, arrival in readings_and_arrivals:
         if not isinstance(reading, Unread):
             payloads.append(_make_message(reader, reading, arrival))
         elif reading.counted is not None:

@@ -150,7 +150,7 @@ def part_of(plant: str, parts: int) -> int:
         The number of the part, 0 <= number < `parts`.
     """
     check_count("parts", parts)
-    value = OFFSET  # FNV-1a, a hash of 32 bits that is the same in every process and program
+    hash_ = OFFSET  # FNV-1a, a hash of 32 bits that is the same in every process and program
     for byte in encode_name(plant).encode():
-        value = (value ^ byte) * PRIME & 0xFFFFFFFF
-    return value % parts
+        hash_ = (hash_ ^ byte) * PRIME & 0xFFFFFFFF
+    return hash_ % parts

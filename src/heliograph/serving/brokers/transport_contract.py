@@ -180,13 +180,12 @@ class _Examination:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
     def _make_bodies(self, total: int) -> list[bytes]:
-        """Return bodies of messages, each with a number that none had before; the first is LONG bytes long.
+        """Return bodies of messages, each with a number that none had before; the first has a text of LONG bytes.
 
-        With a letter of two bytes, so that a transport that changes the encoding is found out.
+        The name of that text is a letter of two bytes, so that a transport that changes the encoding is found out.
         """
-        return [
-            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(total)
-        ]
+        texts = [b"x" * LONG, *[b""] * (total - 1)][:total]
+        return [b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), text) for text in texts]
 
 
 def _drop_repeated(bodies: Iterable[bytes]) -> list[bytes]:
