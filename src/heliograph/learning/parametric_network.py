@@ -144,9 +144,8 @@ class FreeNumberCollector:
         for mark in self.marks:
             if name is not None and mark.given == name:
                 if not np.array_equal(mark.start, start):
-                    raise fail(
-                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
-                    )
+                    expected = f"one start in all places, {mark.start.tolist()}"
+                    raise fail(f"free number {name!r}", expected, start.tolist())
                 return mark_checked(start, mark.report)
         self.marks.append(_MarkedNumber(start, name, kind))
         return mark_checked(start, self.marks[-1].report)
@@ -176,7 +175,7 @@ class ValueReader:
             values: the value of each parameter, by its name.
         """
         self.values = values
-        self.unnamed = iter([p.name for p, single in zip(parameters.every, named, strict=True) if not single])
+        self.unnamed = iter([p.name for p, is_named in zip(parameters.every, named, strict=True) if not is_named])
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """Return the value of this name, or of the next number without a name.
@@ -185,9 +184,8 @@ class ValueReader:
         """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
-            raise fail(
-                "network", "the same free numbers each time it is built", "another one" if name is None else name
-            )
+            got = "another one" if name is None else name
+            raise fail("network", "the same free numbers each time it is built", got)
         return self.values[key]
 
 

@@ -344,10 +344,9 @@ class LinearPlant(AbstractPlant):
 
 def _read_attitude(states: tuple[str, ...], attitude: Sequence[str], circular: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of the states that are rotation vectors, three for each attitude; raise unless they are so."""
-    given = [str(name) for name in items("attitude", attitude, "names")]
-    wrong = len(given) % 3 or len(set(given)) < len(given) or not set(given) <= set(states) - set(circular)
-    if wrong:
-        expected = f"three of {[name for name in states if name not in circular]} for each attitude, each once"
+    given, allowed = [str(name) for name in items("attitude", attitude, "names")], set(states) - set(circular)
+    if len(given) % 3 or len(set(given)) < len(given) or not set(given) <= allowed:
+        expected = f"three of {[name for name in states if name in allowed]} for each attitude, each once"
         raise fail("attitude", expected, given)
     return tuple(given)
 

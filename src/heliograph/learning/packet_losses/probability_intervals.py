@@ -28,14 +28,17 @@ def maximise_over_shares(
     precision: the relative change of the value at which a climb ends.
     """
 
-    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return minus the function and minus its gradient, since SciPy minimises."""
         value, gradient = function(x)
         return -value, -gradient
 
     # Logits beyond END are shares of 0 and 1, as far as data tell.
     bounds = [(-END, END)] * len(starts[0])
-    results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
-    best = min(results, key=lambda end: float(end.fun))
+    results = [
+        minimize(negative, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts
+    ]
+    best = min(results, key=lambda result: float(result.fun))
     return np.asarray(best.x), -float(best.fun)
 
 
@@ -61,8 +64,8 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
     # A logit so near the bounds of the search is a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
-    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, -1)
-    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, 1)
+    low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
+    high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, side=1)
     estimate = float(expit(top[i]))
     if is_zero or is_one:
         estimate = 0.0 if is_zero else 1.0

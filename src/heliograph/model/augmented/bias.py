@@ -134,13 +134,14 @@ class DrivenTransition(Module):
     places: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state [x; b] after a step: x moves as the plant says, plus `coupling` times the biases b.
+        """Return the state [f(x, u) + E b; f_b(b, u_b)] from [x; b], the state of the plant and the biases.
 
-        The biases move by a plant of their own, whose inputs stand at `places` of u.
+        E is `self.coupling`, by which the biases drive the plant; u_b are the inputs at `self.places`, which move them.
         """
         n = len(self.plant.states)
-        moved = self.plant.transition(x[:n], u) + jnp.asarray(self.coupling) @ x[n:]
-        return jnp.concatenate([moved, self.bias.transition(x[n:], u[np.array(self.places, int)])])
+        state, biases = x[:n], x[n:]
+        next_state = self.plant.transition(state, u) + jnp.asarray(self.coupling) @ biases
+        return jnp.concatenate([next_state, self.bias.transition(biases, u[np.array(self.places, int)])])
 
 
 def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.ndarray) -> LinearPlant | Plant:
@@ -231,8 +232,8 @@ def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int
 
 def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
     """Return a list of `count` values, one for each bias, from one value for all or from as many."""
-    given: Any = value
-    values = list(given) if rank(name, value) else [given] * count
+    number_or_sequence: Any = value
+    values = list(number_or_sequence) if rank(name, value) else [number_or_sequence] * count
     if len(values) != count:
         raise fail(name, f"one, or one for each of {count}", len(values))
     return values
